@@ -1,0 +1,1100 @@
+# /// script
+# requires-python = ">=3.10,<3.13"
+# dependencies = [
+#     "mani-skill>=3.0.1,<3.1",
+#     "sapien>=3.0.3,<3.1",
+#     "torch>=2.6,<3",
+#     "gymnasium>=1.0,<2",
+#     "tensorboard>=2.16,<3",
+#     "tyro>=0.9,<2",
+#     "matplotlib>=3.8,<4",
+# ]
+# ///
+"""PPO for ManiSkill from state observations, in one file.
+
+Train     python ppo.py --env_id PushCube-v1
+Evaluate  python ppo.py --evaluate --checkpoint runs/NAME/best.pt
+Watch     runs/NAME/videos/*.mp4, runs/NAME/learning_curve.png, tensorboard --logdir runs
+Help      python ppo.py --help
+
+The same command runs on a GPU, on a CPU and without a renderer. `uv run ppo.py` installs what it needs.
+To make it yours: the network is `Agent`, the numbers are `Args`, the algorithm is `main`, top to bottom.
+"""
+
+import difflib
+import importlib
+import importlib.metadata
+import json
+import logging
+import math
+import os
+import platform
+import random
+import re
+import shlex
+import signal
+import sys
+import time
+import traceback
+import warnings
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal, NoReturn, Optional
+
+warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # reported once, by main, in plain words
+
+import gymnasium as gym
+import numpy as np
+import sapien
+import sapien.wrapper.urdf_loader
+import torch
+import torch.multiprocessing as mp
+import torch.nn as nn
+import tyro
+from torch.distributions import Normal
+from tqdm import tqdm
+
+
+def find_render_device() -> Optional[sapien.Device]:
+    """The device SAPIEN can render with (a CUDA GPU, else any Vulkan device, software ones included), or None."""
+    for name in ("cuda", "pci:0", "cpu"):
+        try:
+            device = sapien.Device(name)
+        except RuntimeError:
+            continue
+        if device.can_render():
+            return device
+    return None
+
+
+RENDER_DEVICE = find_render_device()
+
+if RENDER_DEVICE is None:
+    # Tasks give their objects materials even when nothing is rendered, and SAPIEN makes none without a Vulkan
+    # device. State observations need none either: stand-ins that accept anything let the tasks build.
+    class InertRenderObject:
+        def __init__(self, *args, **kwargs):
+            pass
+
+        def __getattr__(self, name):
+            return lambda *args, **kwargs: None
+
+    for module in (sapien.render, sapien.pysapien.render, sapien.wrapper.urdf_loader):
+        module.RenderMaterial = module.RenderTexture2D = InertRenderObject
+
+import mani_skill.envs  # registers the tasks
+import mani_skill.envs.sapien_env as sapien_env
+from mani_skill.trajectory.merge_trajectory import merge_trajectories
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper
+from mani_skill.utils.wrappers.record import RecordEpisode
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+parse_backends = sapien_env.parse_sim_and_render_backend
+
+
+def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
+    """ManiSkill's render_backend has no name for a Vulkan device without CUDA: put it in where CUDA is not found."""
+    backend = parse_backends(sim_backend, render_backend)
+    if backend.render_device is not None and not backend.render_device.can_render():
+        backend.render_device = RENDER_DEVICE or backend.render_device
+    return backend
+
+
+sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
+# the two warnings that the replacement makes untrue
+logging.getLogger("mani_skill").addFilter(
+    lambda record: not re.match("Requested to use render device", record.getMessage())
+)
+
+
+@dataclass
+class Args:
+    # --- experiment ---
+    exp_name: Optional[str] = None
+    """name of the run, whose files go to runs/<exp_name> (None: <env_id>__ppo__<seed>__<time>)"""
+    seed: int = 1
+    """seed of the weights, the actions and the training episodes"""
+    torch_deterministic: bool = True
+    """ask cuDNN for deterministic algorithms"""
+    cuda: bool = True
+    """use a CUDA GPU where there is one; --no-cuda keeps simulation and learning on the CPU"""
+    track: bool = False
+    """log to Weights & Biases as well (needs: pip install wandb)"""
+    wandb_project_name: str = "ManiSkill"
+    """Weights & Biases project"""
+    wandb_entity: Optional[str] = None
+    """Weights & Biases entity (team)"""
+    wandb_group: str = "PPO"
+    """Weights & Biases group"""
+
+    # --- environment ---
+    env_id: str = "PushCube-v1"
+    """the task: any registered ManiSkill task, or module:EnvId for one of your own"""
+    obs_mode: Literal["state"] = "state"
+    """this script learns from the state vector"""
+    control_mode: Optional[str] = "pd_joint_delta_pos"
+    """controller of the robot (None: the robot's own default)"""
+    robot_uids: Optional[str] = None
+    """robot (None: the task's own)"""
+    reward_mode: Optional[str] = None
+    """normalized_dense, dense, sparse or none (None: the first of these that the task has)"""
+    sim_backend: str = "auto"
+    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
+    render_backend: str = "gpu"
+    """where videos are rendered: gpu (gpu:1), cpu or none; what is not there is replaced by what is"""
+    num_envs: int = 512
+    """parallel training environments (on a CPU: 8 a core)"""
+    num_eval_envs: int = 16
+    """parallel evaluation environments (on a CPU: 4 a core)"""
+    partial_reset: bool = True
+    """end a training episode at success or failure; --no-partial_reset: at the time limit only"""
+    eval_partial_reset: bool = False
+    """end an evaluation episode at success or failure"""
+    reconfiguration_freq: Optional[int] = None
+    """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
+    eval_reconfiguration_freq: Optional[int] = None
+    """rebuild evaluation scenes every so many resets; 1 for tasks that vary their objects"""
+    render_mode: str = "rgb_array"
+    """what videos show: rgb_array (the scene), sensors (the task's cameras) or all"""
+    shader: str = "default"
+    """shader pack of videos: minimal, default, rt-fast or rt"""
+    env_kwargs: str = "{}"
+    """further arguments of gym.make as JSON, such as '{"enhanced_determinism": true}'"""
+
+    # --- PPO ---
+    total_timesteps: int = 10_000_000
+    """environment steps in all (on a CPU: 150,000)"""
+    learning_rate: float = 3e-4
+    """Adam's learning rate (on a CPU: 1e-3)"""
+    critic_learning_rate: Optional[float] = None
+    """learning rate of the critic's layers (None: learning_rate)"""
+    num_steps: Optional[int] = None
+    """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
+    anneal_lr: bool = False
+    """let the learning rate fall linearly to zero over the run (on a CPU: yes)"""
+    gamma: float = 0.8
+    """discount factor"""
+    gae_lambda: float = 0.9
+    """lambda of generalised advantage estimation"""
+    num_minibatches: int = 32
+    """minibatches per epoch (on a CPU: 8); where they do not divide the batch, a random remainder sits out"""
+    update_epochs: int = 4
+    """passes over the batch per iteration (on a CPU: 8)"""
+    norm_adv: bool = True
+    """normalise the advantages of each minibatch"""
+    clip_coef: float = 0.2
+    """clipping range of the probability ratio"""
+    clip_vloss: bool = False
+    """clip the value's change by clip_coef too"""
+    ent_coef: float = 0.0
+    """weight of the entropy bonus"""
+    vf_coef: float = 0.5
+    """weight of the value loss"""
+    max_grad_norm: float = 0.5
+    """largest norm of the gradient"""
+    target_kl: Optional[float] = 0.1
+    """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never)"""
+    reward_scale: float = 1.0
+    """factor on the rewards that are learned from; logged returns are without it"""
+    bootstrap_at_done: Literal["always", "truncated", "never"] = "always"
+    """episode ends at which the value of the final observation still counts"""
+    finite_horizon_gae: bool = False
+    """lambda-weighted mean over the n-step returns that exist, instead of the infinite sum"""
+    shared_features: bool = False
+    """one feature extractor for policy and value, instead of one for each"""
+    norm_obs: bool = False
+    """normalise observations by their running mean and variance (on a CPU: yes)"""
+    logstd_init: float = -0.5
+    """initial logarithm of the policy's standard deviation"""
+
+    # --- evaluation and checkpoints ---
+    eval_freq: int = 25
+    """evaluate every so many iterations (on a CPU: 10), and always before the first and after the last; 0: only then"""
+    num_eval_episodes: int = 64
+    """episodes of an evaluation"""
+    num_eval_steps: Optional[int] = None
+    """instead of num_eval_episodes: steps in each evaluation environment, as many episodes as fit, at least one"""
+    eval_seed: int = 0
+    """evaluation episode k starts from seed eval_seed + k, below 2^31; training's seeds lie above"""
+    stop_at_success: Optional[float] = None
+    """end the run once an evaluation's success_once reaches this rate"""
+    evaluate: bool = False
+    """only evaluate --checkpoint, which brings its task, network and flags along"""
+    checkpoint: Optional[str] = None
+    """checkpoint to evaluate, or whose weights training starts from"""
+    save_model: bool = True
+    """write best.pt (the best evaluation so far) and last.pt"""
+    save_freq: Optional[int] = None
+    """keep a numbered checkpoint every so many iterations too"""
+    capture_video: bool = True
+    """film the first episodes of each evaluation, where there is a renderer"""
+    save_train_video_freq: Optional[int] = None
+    """film the training environments every so many iterations"""
+    save_trajectory: bool = False
+    """write the evaluation episodes as ManiSkill trajectories, beside the videos"""
+
+    # --- runtime ---
+    compile: bool = False
+    """accepted, has no effect yet"""
+    cudagraphs: bool = False
+    """accepted, has no effect yet"""
+
+    @property
+    def batch_size(self) -> int:
+        return self.num_envs * self.num_steps
+
+    @property
+    def minibatch_size(self) -> int:
+        return self.batch_size // self.num_minibatches
+
+    @property
+    def num_iterations(self) -> int:
+        return self.total_timesteps // self.batch_size
+
+
+CPU_DEFAULTS = dict(
+    total_timesteps=150_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
+    eval_freq=10,
+)  # fmt: skip
+
+
+def fail(message: str) -> NoReturn:
+    """Refuse bad input: one line, exit code 2."""
+    print(f"ppo.py: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+def num_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def parse_args(argv: list[str]) -> Args:
+    """Command line to Args. The defaults are those of the checkpoint to evaluate, or of the simulation backend: on a
+    GPU steps are cheap and hundreds of environments run at once, on a CPU each step is learned from more often."""
+    args = tyro.cli(Args, args=[arg for arg in argv if arg not in ("-h", "--help")])
+    args.sim_backend = resolve_backend(args)
+    default = Args()
+    if args.evaluate:
+        stored = load_checkpoint(args.checkpoint)["args"]
+        machine = ("cuda", "sim_backend", "render_backend", "num_eval_envs", "num_eval_episodes", "num_eval_steps",
+                   "eval_seed", "capture_video", "save_trajectory")  # fmt: skip
+        default = replace(default, **{k: v for k, v in stored.items() if hasattr(default, k) and k not in machine})
+    if args.sim_backend == "physx_cpu":
+        default.num_eval_envs = 4 * num_cores()
+        if not args.evaluate:
+            default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores())
+    args = tyro.cli(Args, args=argv, default=default)
+    args.sim_backend = resolve_backend(args)
+    if args.num_steps is None:
+        args.num_steps = max(5, 1600 // args.num_envs) if args.sim_backend == "physx_cpu" else 50
+    return args
+
+
+def resolve_backend(args: Args) -> str:
+    if args.sim_backend == "auto":
+        return "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
+    return {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}.get(args.sim_backend, args.sim_backend)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Environments
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
+    """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
+    `index` tells it from the others and only the first is filmed."""
+    video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
+    trajectory = evaluation and args.save_trajectory
+    optional = dict(
+        control_mode=args.control_mode,
+        robot_uids=tuple(args.robot_uids.split(",")) if args.robot_uids and "," in args.robot_uids else args.robot_uids,
+        reward_mode=args.reward_mode,
+        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
+        human_render_camera_configs=dict(shader_pack=args.shader) if video else None,
+    )
+    env = gym.make(
+        args.env_id,
+        num_envs=num_envs,
+        obs_mode=args.obs_mode,
+        sim_backend=args.sim_backend,
+        render_backend=args.render_backend if video else "none",
+        render_mode=args.render_mode if video else None,
+        **{k: v for k, v in optional.items() if v is not None},
+        **json.loads(args.env_kwargs),
+    )
+    if isinstance(env.action_space, gym.spaces.Dict):
+        env = FlattenActionSpaceWrapper(env)
+    if video or trajectory:
+        base_env, seeds_filmed = env.unwrapped, args.num_eval_envs * (4 if args.evaluate else 1)
+        env = RecordEpisode(
+            env,
+            output_dir=str(record_dir),
+            save_video=video,
+            save_video_trigger=lambda step: (
+                base_env._episode_seed[0] < args.eval_seed + seeds_filmed
+                if evaluation
+                else step // args.num_steps % args.save_train_video_freq == 0
+            ),
+            max_steps_per_video=episode_steps(env, args) if evaluation else args.num_steps,
+            video_fps=base_env.control_freq,
+            save_trajectory=trajectory,
+            trajectory_name=f"trajectory_{index}",
+            source_type="rl",
+            source_desc="PPO",
+        )
+    return env
+
+
+def episode_steps(env: gym.Env, args: Args) -> int:
+    """The task's time limit; for a task without one, num_eval_steps."""
+    return find_max_episode_steps_value(env) or args.num_eval_steps or 1000
+
+
+def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
+    """Body of a worker process: build the environments `indices`, then answer each message with one message.
+
+    Each environment has its own stream of torch random numbers, so that its episodes depend on neither its neighbours
+    nor the number of workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process to handle
+    torch.set_num_threads(1)
+    torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
+
+    def in_own_stream(i, function, *args, **kwargs):
+        torch.set_rng_state(streams[i])
+        result = function(*args, **kwargs)
+        streams[i] = torch.get_rng_state()
+        return result
+
+    def batch(infos):
+        return {
+            k: torch.cat([info[k] for info in infos]).numpy() if isinstance(v, torch.Tensor) else v
+            for k, v in infos[0].items()
+        }
+
+    try:
+        envs, streams = [], []
+        for index in indices:
+            torch.manual_seed(index)
+            np.random.seed(index)
+            envs.append(make_env(index))
+            streams.append(torch.get_rng_state())
+            conn.send("built")
+        spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
+        conn.send((spaces, find_max_episode_steps_value(envs[0])))
+        obs, reset_obs, rewards, terminated, truncated, actions = [
+            buffer[indices[0] : indices[-1] + 1] for buffer in conn.recv()
+        ]
+        while True:
+            command, *data = conn.recv()
+            if command == "step":
+                results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
+                *tensors, infos = zip(*results)
+                for buffer, rows in zip((obs, rewards, terminated, truncated), tensors):
+                    torch.cat(rows, out=buffer)
+                infos = batch(infos)  # before the resets, which write into the same tensors
+                ended = (truncated if ignore_terminations else terminated | truncated).nonzero().flatten().tolist()
+                reset_infos = []
+                for i in ended if auto_reset else []:
+                    reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset)
+                    reset_infos.append(info)
+                conn.send((infos, batch(reset_infos) if reset_infos else None))
+            elif command == "reset":
+                reset_infos = []
+                for i, seed in zip(*data[:2]):
+                    if seed is not None:
+                        streams[i] = torch.Generator().manual_seed(seed).get_state()
+                    reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=data[2])
+                    reset_infos.append(info)
+                conn.send(batch(reset_infos) if reset_infos else None)
+            else:
+                for env in envs:
+                    env.close()
+                conn.send("closed")
+                return
+    except (EOFError, BrokenPipeError):
+        pass  # the main process is gone
+    except BaseException:
+        conn.send(RuntimeError(traceback.format_exc()))
+
+
+class CPUVectorEnv(gym.Env):
+    """`num_envs` CPU-simulated environments as one batched environment, to be wrapped by ManiSkillVectorEnv.
+
+    Worker processes, one a core, each step their share of the environments one after the other. Observations,
+    rewards, flags and actions pass through shared memory, and a step costs one message to each worker and one back:
+    with `auto_reset` a worker also resets the episodes that ended, so that the partial reset which ManiSkillVectorEnv
+    asks for next finds its work done.
+
+    Args:
+        make_env: picklable function from an index in [0, num_envs) to a ManiSkill environment with num_envs=1.
+        ignore_terminations: as given to ManiSkillVectorEnv: whether an episode ends at its time limit only.
+        description: what a progress bar calls the environments while they are built.
+
+    Raises:
+        RuntimeError: with the traceback of a worker that failed.
+    """
+
+    device = torch.device("cpu")
+    reconfiguration_freq = 0  # as a batch; each environment is a scene of its own and keeps its own frequency
+
+    def __init__(self, make_env, num_envs, num_workers, auto_reset=True, ignore_terminations=False, description=""):
+        self.num_envs = num_envs
+        self.metadata = {}
+        self.auto_reset = auto_reset
+        context = mp.get_context("spawn")
+        self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
+        self.conns, self.workers = [], []
+        for share in self.shares:
+            conn, worker_conn = context.Pipe()
+            worker = context.Process(
+                target=cpu_worker, args=(worker_conn, make_env, share, auto_reset, ignore_terminations), daemon=True
+            )
+            worker.start()
+            worker_conn.close()  # so that a dead worker reads as the end of its pipe
+            self.conns.append(conn)
+            self.workers.append(worker)
+        with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
+            for i in range(len(self.shares[0])):
+                for w, share in enumerate(self.shares):
+                    if i < len(share):
+                        self._receive(w)
+                        bar.update()
+        spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+        self.single_observation_space, self.single_action_space = spaces
+        self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
+        obs, actions = [torch.zeros(num_envs, *space.shape) for space in spaces]
+        flags = torch.zeros(num_envs, dtype=torch.bool)
+        buffers = [obs, obs.clone(), torch.zeros(num_envs), flags, flags.clone(), actions]
+        self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions = buffers
+        for buffer in buffers:
+            buffer.share_memory_()
+        for conn in self.conns:
+            conn.send(buffers)
+        self.infos, self.reset_infos = {}, []
+
+    def _receive(self, w):
+        try:
+            message = self.conns[w].recv()
+        except (EOFError, ConnectionResetError):
+            self.workers[w].join(5)
+            message = RuntimeError(f"died with exit code {self.workers[w].exitcode}")
+        if isinstance(message, RuntimeError):
+            raise RuntimeError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}): {message}")
+        return message
+
+    @staticmethod
+    def _concatenate(infos):
+        return {
+            k: torch.from_numpy(np.concatenate([info[k] for info in infos])) if isinstance(v, np.ndarray) else v
+            for k, v in infos[0].items()
+        }
+
+    @property
+    def elapsed_steps(self) -> torch.Tensor:
+        return self.infos["elapsed_steps"]
+
+    def step(self, actions: torch.Tensor):
+        self.actions.copy_(actions)
+        for conn in self.conns:
+            conn.send(("step",))
+        infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
+        self.infos = self._concatenate(infos)
+        return self.obs.clone(), self.rewards.clone(), self.terminated.clone(), self.truncated.clone(), dict(self.infos)
+
+    def reset(self, *, seed=None, options=None):
+        options = dict(options or {})
+        env_idx = torch.as_tensor(options.pop("env_idx", range(self.num_envs))).sort().values
+        if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
+            if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
+                seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
+            chosen = set(env_idx.tolist())
+            for conn, share in zip(self.conns, self.shares):
+                rows = [i for i, index in enumerate(share) if index in chosen]
+                conn.send(("reset", rows, [None if seed is None else seed[share[i]] for i in rows], options))
+            self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
+        infos = self._concatenate([info for info in self.reset_infos if info])
+        self.reset_infos = []
+        for k, v in infos.items():
+            if isinstance(v, torch.Tensor) and len(env_idx) < self.num_envs:
+                infos[k] = self.infos[k].index_copy(0, env_idx, v)
+        self.infos = infos
+        self.obs[env_idx] = self.reset_obs[env_idx]
+        return self.obs.clone(), dict(infos)
+
+    def close(self):
+        for conn, worker in zip(self.conns, self.workers):
+            try:
+                conn.send(("close",))
+                conn.recv()
+            except (EOFError, OSError):
+                pass  # it is gone already
+            worker.join(5)
+            worker.kill()
+        self.conns, self.workers = [], []
+
+
+def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
+    """The training or the evaluation environments as one batch. Those for evaluation do not reset by themselves:
+    `evaluate` starts each episode from its seed."""
+    num_envs = args.num_eval_envs if evaluation else args.num_envs
+    ignore_terminations = not (args.eval_partial_reset if evaluation else args.partial_reset)
+    make = partial(make_env, args, record_dir, evaluation)
+    if args.sim_backend == "physx_cpu" and num_envs > 1:
+        what = "building evaluation environments" if evaluation else "building training environments"
+        env = CPUVectorEnv(make, num_envs, num_cores(), not evaluation, ignore_terminations, what)
+    else:
+        env = make(num_envs=num_envs)
+    return ManiSkillVectorEnv(
+        env, auto_reset=not evaluation, ignore_terminations=ignore_terminations, record_metrics=True
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Agent
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def layer_init(layer: nn.Linear, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, std)
+    nn.init.constant_(layer.bias, bias_const)
+    return layer
+
+
+class Agent(nn.Module):
+    """Gaussian policy with state-independent standard deviation, and value function.
+
+    Observations are float32 (batch, obs_dim), actions (batch, act_dim), values and log-probabilities (batch,)."""
+
+    def __init__(self, obs_dim: int, act_dim: int, args: Args):
+        super().__init__()
+
+        def features():
+            return nn.Sequential(
+                layer_init(nn.Linear(obs_dim, 256)), nn.Tanh(),
+                layer_init(nn.Linear(256, 256)), nn.Tanh(),
+                layer_init(nn.Linear(256, 256)), nn.Tanh(),
+            )  # fmt: skip
+
+        self.actor_features = features()
+        self.critic_features = self.actor_features if args.shared_features else features()
+        self.actor_mean = layer_init(nn.Linear(256, act_dim), std=0.01 * math.sqrt(2))
+        self.actor_logstd = nn.Parameter(torch.full((1, act_dim), args.logstd_init))
+        self.critic = layer_init(nn.Linear(256, 1))
+        self.norm_obs = args.norm_obs
+        self.register_buffer("obs_mean", torch.zeros(obs_dim))
+        self.register_buffer("obs_var", torch.ones(obs_dim))
+        self.register_buffer("obs_count", torch.tensor(1e-4))
+
+    def normalize(self, obs):
+        if not self.norm_obs:
+            return obs
+        return ((obs - self.obs_mean) * torch.rsqrt(self.obs_var + 1e-5)).clamp(-10, 10)
+
+    @torch.no_grad()
+    def update_normalization(self, obs):
+        """Merge the mean and variance of a batch of observations into the running ones (Chan et al. 1979)."""
+        count = self.obs_count + len(obs)
+        delta = obs.mean(0) - self.obs_mean
+        m2 = self.obs_var * self.obs_count + obs.var(0, correction=0) * len(obs)
+        self.obs_var.copy_((m2 + delta**2 * self.obs_count * len(obs) / count) / count)
+        self.obs_mean.add_(delta * len(obs) / count)
+        self.obs_count.copy_(count)
+
+    def get_value(self, obs):
+        return self.critic(self.critic_features(self.normalize(obs))).squeeze(-1)
+
+    def get_action(self, obs):
+        """The deterministic action: the mean of the policy."""
+        return self.actor_mean(self.actor_features(self.normalize(obs)))
+
+    def get_action_and_value(self, obs, action=None):
+        """Returns action (sampled unless given), its log-probability, the policy's entropy, and the value."""
+        obs = self.normalize(obs)
+        features = self.actor_features(obs)
+        mean = self.actor_mean(features)
+        policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
+        if action is None:
+            action = policy.sample()
+        if self.critic_features is not self.actor_features:
+            features = self.critic_features(obs)
+        value = self.critic(features).squeeze(-1)
+        return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Algorithm
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_horizon=False):
+    """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
+
+    Args:
+        rewards, values: (num_steps, num_envs), of the step and of the observation it started from.
+        next_values: (num_steps, num_envs), value of the step's true next observation (at the end of an episode: the
+            final one, not the reset one), zero where the episode's end is not to be bootstrapped.
+        dones: (num_steps, num_envs), whether the episode ended with the step.
+        finite_horizon: False: eq. 16, line 2, the infinite lambda-weighted sum. True: line 1, the lambda-weighted mean
+            over those n-step returns that exist before the episode or the rollout ends.
+
+    Returns:
+        (advantages, returns), each (num_steps, num_envs); returns = advantages + values.
+    """
+    not_done = 1.0 - dones.to(rewards.dtype)
+    advantages = torch.zeros_like(rewards)
+    if finite_horizon:
+        # sums over n of lambda^(n-1) times: 1, the rewards within n steps, the value after n steps
+        weight_sum = reward_sum = value_sum = torch.zeros_like(rewards[0])
+        for t in reversed(range(len(rewards))):
+            weight_sum = 1.0 + gae_lambda * not_done[t] * weight_sum
+            reward_sum = weight_sum * rewards[t] + gamma * gae_lambda * not_done[t] * reward_sum
+            value_sum = gamma * next_values[t] + gamma * gae_lambda * not_done[t] * value_sum
+            advantages[t] = (reward_sum + value_sum) / weight_sum - values[t]
+    else:
+        deltas = rewards + gamma * next_values - values
+        decay = gamma * gae_lambda * not_done
+        last = torch.zeros_like(rewards[0])
+        for t in reversed(range(len(rewards))):
+            advantages[t] = last = deltas[t] + decay[t] * last
+    return advantages, advantages + values
+
+
+UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac", "grad_norm")
+KL = UPDATE_METRICS.index("approx_kl")
+
+
+def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values) -> torch.Tensor:
+    """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows.
+
+    Returns the UPDATE_METRICS of the minibatch, one tensor on the device."""
+    _, newlogprob, entropy, newvalue = agent.get_action_and_value(obs, actions)
+    logratio = newlogprob - logprobs
+    ratio = logratio.exp()
+    if args.norm_adv:
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+
+    clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    policy_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+    value_error = (newvalue - returns) ** 2
+    if args.clip_vloss:
+        clipped_value = values + (newvalue - values).clamp(-args.clip_coef, args.clip_coef)
+        value_error = torch.max(value_error, (clipped_value - returns) ** 2)
+    value_loss = 0.5 * value_error.mean()
+    entropy = entropy.mean()
+    loss = policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss
+
+    optimizer.zero_grad()
+    loss.backward()
+    grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+    optimizer.step()
+
+    with torch.no_grad():
+        approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
+        return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Evaluation
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def evaluate(agent, envs, num_episodes: int, seed: int, num_steps: int, device) -> dict[str, torch.Tensor]:
+    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
+
+    Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
+    float tensor (num_episodes,) each, on the CPU. Leaves the random streams of training as they were."""
+    low, high = action_bounds(envs, device)
+    rounds = []
+    numpy_state = np.random.get_state()
+    with torch.random.fork_rng():
+        for first in range(seed, seed + num_episodes, envs.num_envs):
+            obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)))
+            running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
+            episodes = {}
+            for step in range(1, num_steps + 1):
+                action = agent.get_action(obs.to(device)).clamp(low, high)
+                obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
+                ended = running & (terminated | truncated | (step == num_steps))
+                running &= ~ended
+                at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
+                for k, v in (infos["episode"] | at_end).items():
+                    episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+            rounds.append(episodes)
+    np.random.set_state(numpy_state)
+    return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"}
+
+
+def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
+    """95% confidence interval of the mean of `values`: Wilson's score interval for a rate, else the normal one."""
+    n, mean, z = len(values), values.double().mean().item(), 1.96
+    if rate:
+        centre = (mean + z**2 / (2 * n)) / (1 + z**2 / n)
+        half = z / (1 + z**2 / n) * math.sqrt(mean * (1 - mean) / n + z**2 / (4 * n**2))
+    else:
+        centre = mean
+        half = z * values.double().std().item() / math.sqrt(n) if n > 1 else math.inf
+    return centre - half, centre + half
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Checkpoints and results
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(path: Path, contents: dict) -> None:
+    """Write beside, then rename: at any instant the file is the old checkpoint or the new one, whole."""
+    temporary = path.with_suffix(".tmp")
+    torch.save(contents, temporary)
+    os.replace(temporary, path)
+
+
+def load_checkpoint(path: Optional[str]) -> dict:
+    if path is None:
+        fail("--evaluate needs --checkpoint runs/NAME/best.pt")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        fail(f"there is no checkpoint {path}")
+    except Exception as error:
+        fail(f"{path} cannot be read as a checkpoint: {str(error).splitlines()[0]}")
+    if not isinstance(checkpoint, dict) or not {"agent", "args"} <= checkpoint.keys():
+        fail(f"{path} is no checkpoint of this script")
+    return checkpoint
+
+
+def name_videos(folder: Path, name: str) -> list[Path]:
+    """RecordEpisode numbers its files; name the new ones after the evaluation that they show."""
+    numbered = sorted(path for path in folder.glob("*.mp4") if path.stem.isdigit())
+    names = [f"{name}.mp4" if len(numbered) == 1 else f"{name}_{i}.mp4" for i in range(len(numbered))]
+    return [path.replace(folder / new) for path, new in zip(numbered, names)]
+
+
+def merge_recorded(folder: Path) -> None:
+    """One trajectory.h5 (and .json) from the files that the environments wrote each for itself."""
+    parts = sorted(folder.glob("trajectory_*.h5"), key=lambda path: int(path.stem.split("_")[1]))
+    if parts:
+        merge_trajectories(str(folder / "trajectory.h5"), parts)
+        for part in parts:
+            part.unlink()
+            part.with_suffix(".json").unlink()
+
+
+def plot_learning_curve(run_dir: Path) -> None:
+    """Draw learning_curve.png from metrics.jsonl: success, where the task knows it, and return over steps."""
+    from matplotlib.figure import Figure
+
+    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    keys = [key for key in ("success_once", "return") if any(key in row for row in rows)]
+    figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
+    for axis, key in zip(np.atleast_1d(figure.subplots(1, len(keys))), keys):
+        for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
+            points = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind and key in row]
+            if points:
+                axis.plot(*zip(*points), label={"train": "training", "eval": "evaluation"}[kind], **style)
+        axis.set(title=key, xlabel="environment steps", ylim=(-0.03, 1.03) if key == "success_once" else None)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    figure.savefig(run_dir / "learning_curve.png", dpi=120)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Main
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def check(args: Args) -> None:
+    """Refuse what cannot work, before anything is built or written."""
+    module, _, name = args.env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+    except ImportError as error:
+        fail(f"--env_id {args.env_id}: {error}")
+    if name not in REGISTERED_ENVS:
+        nearest = (
+            ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS))
+            or "python -m mani_skill.examples.demo_random_action --help"
+        )
+        fail(f"--env_id {args.env_id}: no such task; the nearest names are: {nearest}")
+    if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
+        fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
+    if args.sim_backend != "physx_cpu" and not torch.cuda.is_available():
+        fail(
+            f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch {torch.__version__} finds none: use physx_cpu"
+        )
+    for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes"):
+        if getattr(args, flag) < 1:
+            fail(f"--{flag} must be at least 1")
+    if args.batch_size < args.num_minibatches:
+        fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
+    if not args.evaluate and args.num_iterations < 1:
+        fail(
+            f"--total_timesteps {args.total_timesteps} is less than one iteration, num_envs * num_steps = {args.batch_size}"
+        )
+    try:
+        assert isinstance(json.loads(args.env_kwargs), dict)
+    except (ValueError, AssertionError):
+        fail(f"--env_kwargs must be a JSON object such as '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
+
+
+def choose_device(args: Args) -> torch.device:
+    """Where the agent learns: with the simulation on its GPU, else on any GPU there is, else on the CPU."""
+    if args.sim_backend.startswith("physx_cuda"):
+        return torch.device(args.sim_backend.replace("physx_", ""))
+    return torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+
+
+def summary(metrics: dict) -> str:
+    """The metrics that a person follows, in a few words."""
+    names = {"success_once": "success", "return": "return", "episode_len": "length"}
+    return ", ".join(f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics)
+
+
+def action_bounds(envs, device) -> tuple[torch.Tensor, torch.Tensor]:
+    space = envs.single_action_space
+    return torch.as_tensor(space.low, device=device), torch.as_tensor(space.high, device=device)
+
+
+def prepare_rendering(args: Args) -> None:
+    """Switch videos off, with one line, where nothing can render them."""
+    if args.render_backend == "none":
+        args.capture_video, args.save_train_video_freq = False, None
+    if RENDER_DEVICE is None and (args.capture_video or args.save_train_video_freq):
+        print(
+            "no videos: there is no Vulkan device (a CPU renders with: apt install mesa-vulkan-drivers, Mesa 23.1 on)"
+        )
+        args.capture_video, args.save_train_video_freq = False, None
+
+
+def evaluate_checkpoint(args: Args) -> None:
+    """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
+    checkpoint = load_checkpoint(args.checkpoint)
+    run_dir, device = Path(args.checkpoint).parent, choose_device(args)
+    envs = make_envs(args, run_dir / "test_videos", evaluation=True)
+    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0], args).to(device)
+    agent.load_state_dict(checkpoint["agent"])
+    episodes = evaluate(agent, envs, args.num_eval_episodes, args.eval_seed, episode_steps(envs, args), device)
+    envs.close()
+    merge_recorded(run_dir / "test_videos")
+    videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
+
+    results = {"env_id": args.env_id, "num_episodes": args.num_eval_episodes, "eval_seed": args.eval_seed}
+    print(f"{args.env_id}, {args.num_eval_episodes} episodes from seed {args.eval_seed} on, with 95% intervals:")
+    for key, values in episodes.items():
+        low, high = interval(values, rate=key.startswith(("success", "fail")))
+        results |= {key: values.mean().item(), f"{key}_interval": [low, high]}
+        print(f"  {key:<16}{results[key]:8.3f}  [{low:.3f}, {high:.3f}]")
+    (run_dir / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
+    print(f"written: {', '.join(map(str, [run_dir / 'eval.json', *videos]))}")
+
+
+def train(args: Args) -> None:
+    # --- run folder, seeds, environments, agent ---
+    run_name = args.exp_name or f"{args.env_id.split(':')[-1]}__ppo__{args.seed}__{int(time.time())}"
+    run_dir = Path("runs") / run_name
+    if (run_dir / "metrics.jsonl").exists():
+        fail(f"{run_dir} holds a run already: choose another --exp_name or remove it")
+    device = choose_device(args)
+    random.seed(args.seed)
+    np.random.seed(args.seed)
+    torch.manual_seed(args.seed)
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+
+    envs = make_envs(args, run_dir / "train_videos")
+    eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
+    obs_dim, act_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    low, high = action_bounds(envs, device)
+    max_eval_steps = episode_steps(eval_envs, args)
+
+    agent = Agent(obs_dim, act_dim, args).to(device)
+    critic_only = [] if args.shared_features else list(agent.critic_features.parameters())
+    critic_only += agent.critic.parameters()
+    others = [p for p in agent.parameters() if all(p is not q for q in critic_only)]
+    groups = [
+        {"params": others, "lr": args.learning_rate},
+        {"params": critic_only, "lr": args.critic_learning_rate or args.learning_rate},
+    ]
+    initial_lrs = [group["lr"] for group in groups]
+    optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
+    if args.checkpoint:
+        agent.load_state_dict(load_checkpoint(args.checkpoint)["agent"])
+
+    # --- logging ---
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the workers need none
+
+    run_dir.mkdir(parents=True, exist_ok=True)
+    packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
+    about = {
+        "args": asdict(args),
+        "versions": {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in packages},
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {num_cores()} cores",
+        "command": shlex.join(sys.argv),
+    }
+    (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
+    if args.track:
+        import wandb
+
+        wandb.init(project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_name,
+                   config=about, sync_tensorboard=True, save_code=True)  # fmt: skip
+    writer = SummaryWriter(str(run_dir))
+    metrics_file = open(run_dir / "metrics.jsonl", "a", buffering=1)
+    bar = tqdm(total=args.num_iterations * args.batch_size, unit="step", dynamic_ncols=True, disable=None,
+               bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}")  # fmt: skip
+    bar.write(
+        f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}, {run_dir}"
+    )
+
+    def log(kind: str, metrics: dict) -> None:
+        metrics_file.write(json.dumps({"kind": kind, "global_step": global_step, **metrics}) + "\n")
+        for key, value in metrics.items():
+            writer.add_scalar(f"{kind}/{key}", value, global_step)
+
+    def checkpoint() -> dict:
+        rng = {"cpu": torch.get_rng_state()} | (
+            {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+        )
+        return {
+            "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "rng": rng, "iteration": iteration,
+            "global_step": global_step, "best_score": best_score, "args": asdict(args), "versions": about["versions"],
+        }  # fmt: skip
+
+    # --- rollout storage ---
+    shape = (args.num_steps, args.num_envs)
+    obs = torch.zeros(*shape, obs_dim, device=device)
+    actions = torch.zeros(*shape, act_dim, device=device)
+    logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
+
+    # training's seeds lie in [2^31, 2^32), evaluation's below
+    seeds = np.random.SeedSequence(args.seed).generate_state(args.num_envs) // 2 + 2**31
+    next_obs, _ = envs.reset(seed=seeds.tolist())
+    next_obs = next_obs.to(device)
+    global_step, best_score, last_line = 0, [-math.inf], time.monotonic()
+
+    try:
+        for iteration in range(args.num_iterations + 1):  # the number of finished updates
+            # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
+            last = iteration == args.num_iterations
+            if last or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0):
+                torch.set_num_threads(1)
+                episodes = evaluate(agent, eval_envs, args.num_eval_episodes, args.eval_seed, max_eval_steps, device)
+                metrics = {key: value.mean().item() for key, value in episodes.items()}
+                log("eval", metrics | {"num_episodes": args.num_eval_episodes})
+                name_videos(run_dir / "videos", f"step_{global_step:09d}")
+                score = [metrics[key] for key in ("success_once", "return") if key in metrics]
+                best = score > best_score
+                best_score = max(score, best_score)
+                bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
+                if args.save_model and best:
+                    save_checkpoint(run_dir / "best.pt", checkpoint())
+                if args.save_model:
+                    save_checkpoint(run_dir / "last.pt", checkpoint())
+                plot_learning_curve(run_dir)
+                reached = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
+                if last or reached:
+                    break
+            if args.save_model and args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
+                save_checkpoint(run_dir / f"iteration_{iteration}.pt", checkpoint())
+
+            # --- rollout: num_steps in every environment ---
+            start = time.perf_counter()
+            torch.set_num_threads(1)  # idle threads spin, and the cores belong to the simulation now
+            episode_sums, num_episodes = {}, torch.zeros((), device=device)
+            for step in range(args.num_steps):
+                obs[step] = next_obs
+                with torch.no_grad():
+                    actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
+                action = actions[step].clamp(low, high)
+                next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
+                next_obs, terminated, truncated = next_obs.to(device), terminated.to(device), truncated.to(device)
+                done = terminated | truncated
+                rewards[step] = reward.to(device) * args.reward_scale
+                dones[step] = done
+                if "final_observation" in infos:  # next_obs is the first of a new episode where done
+                    with torch.no_grad():
+                        final_value = agent.get_value(infos["final_observation"].to(device))
+                    bootstrapped = {"always": done, "truncated": truncated & ~terminated, "never": done & False}
+                    next_values[step] = torch.where(bootstrapped[args.bootstrap_at_done], final_value, 0.0)
+                    num_episodes += done.sum()
+                    for key, value in infos["final_info"]["episode"].items():
+                        total = torch.where(done, value.to(device).float(), 0.0).sum()
+                        episode_sums[key] = episode_sums.get(key, 0.0) + total
+            global_step += args.batch_size
+            with torch.no_grad():
+                following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
+            next_values = torch.where(dones.bool(), next_values, following)
+            advantages, returns = compute_gae(
+                rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
+            )
+            rollout_time = time.perf_counter() - start
+
+            # --- update: update_epochs times over the batch, in shuffled minibatches ---
+            torch.set_num_threads(num_cores())
+            if args.anneal_lr:
+                for group, lr in zip(optimizer.param_groups, initial_lrs):
+                    group["lr"] = lr * (1 - iteration / args.num_iterations)
+            batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
+            update_metrics = []
+            for epoch in range(args.update_epochs):
+                permutation = torch.randperm(args.batch_size, device=device)[
+                    : args.num_minibatches * args.minibatch_size
+                ]
+                for mb_inds in permutation.view(args.num_minibatches, -1):
+                    minibatch = [x[mb_inds] for x in batch]
+                    update_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
+                epoch_kl = torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean()
+                if args.target_kl is not None and epoch_kl > args.target_kl:
+                    break
+            if args.norm_obs:  # after the update, for which the log-probabilities of the rollout must stay valid
+                agent.update_normalization(batch[0])
+            explained_variance = 1 - (returns - values).var() / returns.var()
+
+            # --- log: here alone does the host wait for the device ---
+            metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
+            if episode_sums:
+                means = torch.stack([*episode_sums.values()]) / num_episodes
+                metrics = dict(zip(episode_sums, means.tolist())) | metrics
+            elapsed = time.perf_counter() - start
+            metrics |= {
+                "iteration": iteration + 1,
+                "num_episodes": int(num_episodes),
+                "explained_variance": explained_variance.item(),
+                "learning_rate": optimizer.param_groups[0]["lr"],
+                "sps": args.batch_size / elapsed,
+                "rollout_time": rollout_time,
+                "update_time": elapsed - rollout_time,
+            }
+            log("train", metrics)
+            bar.set_postfix_str(f"{metrics['sps']:,.0f} steps/s  {summary(metrics)}", refresh=False)
+            bar.update(args.batch_size)
+            if bar.disable and time.monotonic() - last_line > 10:  # no terminal
+                print(
+                    f"step {global_step:>9,}  {metrics['sps']:,.0f} steps/s  training: {summary(metrics)}", flush=True
+                )
+                last_line = time.monotonic()
+    finally:  # also on Ctrl-C or an error: what was learned stays
+        if args.save_model and global_step > 0:
+            save_checkpoint(run_dir / "last.pt", checkpoint())
+        bar.close()
+        writer.close()
+        metrics_file.close()
+        envs.close()
+        eval_envs.close()
+        merge_recorded(run_dir / "videos")
+    print(f"learning curve, videos, metrics and checkpoints are in {run_dir}; evaluate the best policy once more with")
+    print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'}")
+
+
+if __name__ == "__main__":
+    args = parse_args(sys.argv[1:])
+    check(args)
+    prepare_rendering(args)
+    if args.evaluate:
+        evaluate_checkpoint(args)
+    else:
+        train(args)
