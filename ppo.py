@@ -105,7 +105,7 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
 # the two warnings that the replacement makes untrue
-logging.getLogger("mani_skill").addFilter(
+mani_skill.logger.addFilter(
     lambda record: not re.match("Requested to use render device", record.getMessage())
 )
 
@@ -663,6 +663,16 @@ def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_h
     return advantages, advantages + values
 
 
+def bootstraps(rule: str, terminated: torch.Tensor, truncated: torch.Tensor) -> torch.Tensor:
+    """Whether the value of an episode's final observation counts, for each environment, bool (num_envs,).
+
+    ManiSkill's rewards are positive at every step, so that without it ("never") an early success would be worth less
+    than dawdling; "truncated" is the textbook's rule (Pardo et al. 2018, arXiv 1712.00378)."""
+    if rule == "truncated":
+        return truncated & ~terminated
+    return torch.full_like(truncated, rule == "always")
+
+
 UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac", "grad_norm")
 KL = UPDATE_METRICS.index("approx_kl")
 
@@ -905,6 +915,7 @@ def train(args: Args) -> None:
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
+    torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
 
     envs = make_envs(args, run_dir / "train_videos")
     eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
@@ -918,7 +929,7 @@ def train(args: Args) -> None:
     others = [p for p in agent.parameters() if all(p is not q for q in critic_only)]
     groups = [
         {"params": others, "lr": args.learning_rate},
-        {"params": critic_only, "lr": args.critic_learning_rate or args.learning_rate},
+        {"params": critic_only, "lr": args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate},
     ]
     initial_lrs = [group["lr"] for group in groups]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
@@ -981,7 +992,6 @@ def train(args: Args) -> None:
             # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
             last = iteration == args.num_iterations
             if last or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0):
-                torch.set_num_threads(1)
                 episodes = evaluate(agent, eval_envs, args.num_eval_episodes, args.eval_seed, max_eval_steps, device)
                 metrics = {key: value.mean().item() for key, value in episodes.items()}
                 log("eval", metrics | {"num_episodes": args.num_eval_episodes})
@@ -1003,7 +1013,6 @@ def train(args: Args) -> None:
 
             # --- rollout: num_steps in every environment ---
             start = time.perf_counter()
-            torch.set_num_threads(1)  # idle threads spin, and the cores belong to the simulation now
             episode_sums, num_episodes = {}, torch.zeros((), device=device)
             for step in range(args.num_steps):
                 obs[step] = next_obs
@@ -1018,8 +1027,7 @@ def train(args: Args) -> None:
                 if "final_observation" in infos:  # next_obs is the first of a new episode where done
                     with torch.no_grad():
                         final_value = agent.get_value(infos["final_observation"].to(device))
-                    bootstrapped = {"always": done, "truncated": truncated & ~terminated, "never": done & False}
-                    next_values[step] = torch.where(bootstrapped[args.bootstrap_at_done], final_value, 0.0)
+                    next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
                     num_episodes += done.sum()
                     for key, value in infos["final_info"]["episode"].items():
                         total = torch.where(done, value.to(device).float(), 0.0).sum()
@@ -1052,6 +1060,7 @@ def train(args: Args) -> None:
                     break
             if args.norm_obs:  # after the update, for which the log-probabilities of the rollout must stay valid
                 agent.update_normalization(batch[0])
+            torch.set_num_threads(1)
             explained_variance = 1 - (returns - values).var() / returns.var()
 
             # --- log: here alone does the host wait for the device ---

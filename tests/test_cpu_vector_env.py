@@ -1,0 +1,165 @@
+"""The worker pool against the real ManiSkillVectorEnv with one environment: nothing may differ, to the last bit."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import ppo
+
+ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=3, capture_video=False)
+SEEDS = [7, 2**31 + 5, 123]
+
+
+def record(envs, actions, reseed_at):
+    """Everything that envs return over the actions, as a list of flat dicts of cloned tensors."""
+    steps = []
+    obs, info = envs.reset(seed=SEEDS[: envs.num_envs] if envs.num_envs > 1 else envs.seeds)
+    steps.append(flatten(dict(obs=obs, info=info)))
+    for t, action in enumerate(actions):
+        if t == reseed_at:
+            obs, info = envs.reset(seed=[s + 1 for s in (SEEDS if envs.num_envs > 1 else envs.seeds)])
+            steps.append(flatten(dict(obs=obs, info=info)))
+        obs, reward, terminated, truncated, info = envs.step(action)
+        step = dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info)
+        steps.append(flatten(step))
+    return steps
+
+
+def flatten(tree, prefix=""):
+    flat = {}
+    for k, v in tree.items():
+        if isinstance(v, dict):
+            flat |= flatten(v, f"{prefix}{k}.")
+        elif isinstance(v, torch.Tensor):
+            flat[prefix + k] = v.clone()
+    return flat
+
+
+@pytest.mark.parametrize("partial_reset", [True, False])
+@pytest.mark.parametrize("env_id", ["PushCube-v1", "PickCube-v1", "MS-CartpoleBalance-v1", "RollBall-v1"])
+def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
+    """Episodes end by success or failure at different times, and by the time limit; then the environments reset
+    themselves from their own random streams."""
+    args = replace(ARGS, env_id=env_id, partial_reset=partial_reset, env_kwargs='{"max_episode_steps": 15}')
+    generator = torch.Generator().manual_seed(0)
+    envs = ppo.make_envs(args, tmp_path)
+    try:
+        actions = 2 * torch.rand(70, 3, *envs.single_action_space.shape, generator=generator) - 1
+        if env_id == "MS-CartpoleBalance-v1":
+            actions = actions.sign()  # so that the pole falls
+        pool = record(envs, actions, reseed_at=40)
+    finally:
+        envs.close()
+    ended_at = set()
+    for i, seed in enumerate(SEEDS):
+        torch.manual_seed(seed)  # the pool gives each environment a stream that starts from its seed
+        single = ppo.make_envs(replace(args, num_envs=1), tmp_path)
+        assert type(single.base_env).__name__ != "CPUVectorEnv"
+        single.seeds = [seed]
+        torch.manual_seed(seed)
+        alone = []
+        obs, info = single.reset(seed=seed)
+        alone.append(flatten(dict(obs=obs, info=info)))
+        for t in range(70):
+            if t == 40:
+                torch.manual_seed(seed + 1)
+                obs, info = single.reset(seed=seed + 1)
+                alone.append(flatten(dict(obs=obs, info=info)))
+            obs, reward, terminated, truncated, info = single.step(actions[t, i : i + 1])
+            alone.append(
+                flatten(dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info))
+            )
+        single.close()
+        for t, (theirs, ours) in enumerate(zip(alone, pool, strict=True)):
+            ended = "info._final_info" in theirs and bool(theirs["info._final_info"])
+            if ended:
+                ended_at.add((i, t))
+                assert theirs.keys() == ours.keys()
+                assert not torch.equal(ours["info.final_observation"][i], ours["obs"][i])
+            # where another environment of the pool ended, it also has final_... entries of this one
+            for key in theirs.keys() if ended or "info._final_info" not in ours else theirs.keys() & ours.keys():
+                assert torch.equal(theirs[key][0], ours[key][i]), (i, t, key)
+                assert theirs[key].dtype == ours[key].dtype
+    assert len(ended_at) >= 6, "several episodes must end"
+
+
+def test_independent_of_number_of_workers(tmp_path):
+    """Environment i plays the same episodes whatever process it is in and whoever is beside it."""
+    actions = 2 * torch.rand(60, 5, 8, generator=torch.Generator().manual_seed(0)) - 1
+    runs = []
+    for workers in (1, 3):
+        make = ppo.partial(ppo.make_env, replace(ARGS, env_kwargs='{"max_episode_steps": 9}'), tmp_path, False)
+        envs = ppo.ManiSkillVectorEnv(ppo.CPUVectorEnv(make, 5, workers), record_metrics=True)
+        envs.reset(seed=3)
+        runs.append([flatten(dict(zip("ortui", envs.step(a)))) for a in actions])
+        envs.close()
+    for a, b in zip(*runs):
+        assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_partial_reset_by_hand(tmp_path):
+    """reset(options={"env_idx": ...}) touches the named environments alone, seeds or not."""
+    envs = ppo.CPUVectorEnv(ppo.partial(ppo.make_env, ARGS, tmp_path, False), 5, 2, auto_reset=False)
+    try:
+        first, _ = envs.reset(seed=[1, 2, 3, 4, 5])
+        again, _ = envs.reset(seed=[1, 2, 3, 4, 5])
+        assert torch.equal(first, again)
+        for _ in range(3):
+            before, *_ = envs.step(torch.ones(5, 8))
+        obs, info = envs.reset(seed=[1, 2, 3, 4, 5], options={"env_idx": torch.tensor([3, 1])})
+        assert torch.equal(obs[[1, 3]], first[[1, 3]]) and torch.equal(obs[[0, 2, 4]], before[[0, 2, 4]])
+        assert info["elapsed_steps"].tolist() == [3, 0, 3, 0, 3]
+        assert torch.equal(envs.elapsed_steps, info["elapsed_steps"])
+        obs, _ = envs.reset(options={"env_idx": torch.tensor([0])})
+        assert not torch.equal(obs[0], before[0]) and torch.equal(obs[[1, 3]], first[[1, 3]])
+    finally:
+        envs.close()
+
+
+def test_returned_tensors_are_not_overwritten(tmp_path):
+    envs = ppo.CPUVectorEnv(ppo.partial(ppo.make_env, ARGS, tmp_path, False), 2, 2)
+    try:
+        results = [envs.reset(seed=0)[0]] + [envs.step(torch.ones(2, 8))[0] for _ in range(3)]
+        kept = [r.clone() for r in results]
+        envs.step(-torch.ones(2, 8))
+        assert all(torch.equal(a, b) for a, b in zip(results, kept)) and not torch.equal(results[1], results[2])
+    finally:
+        envs.close()
+
+
+def broken_env(index):
+    raise ValueError("no such asset")
+
+
+def test_error_in_worker_is_told(tmp_path):
+    with pytest.raises(RuntimeError, match="(?s)worker 0 .*no such asset"):
+        ppo.CPUVectorEnv(broken_env, 2, 2)
+
+
+def test_killed_worker_is_noticed(tmp_path):
+    envs = ppo.CPUVectorEnv(ppo.partial(ppo.make_env, ARGS, tmp_path, False), 2, 2)
+    envs.reset(seed=0)
+    os.kill(envs.workers[1].pid, signal.SIGKILL)
+    start = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"worker 1 \(environments 1 to 1\).*-9"):
+        for _ in range(3):
+            envs.step(torch.zeros(2, 8))
+    assert time.monotonic() - start < 10
+    envs.close()
+
+
+def test_int_seed_follows_maniskills_rule(tmp_path):
+    envs = ppo.CPUVectorEnv(ppo.partial(ppo.make_env, ARGS, tmp_path, False), 3, 2)
+    try:
+        by_int, _ = envs.reset(seed=11)
+        by_list, _ = envs.reset(seed=[11, *np.random.RandomState(11).randint(2**31, size=2).tolist()])
+        assert torch.equal(by_int, by_list)
+        assert Path(tmp_path).exists() and not list(tmp_path.iterdir()), "nothing is written without being asked"
+    finally:
+        envs.close()

@@ -1,0 +1,125 @@
+"""The gradient step against PPO's loss and Adam's rule, calculated independently in float64."""
+
+import numpy as np
+import pytest
+import torch
+
+import ppo
+
+OBS, ACT, ROWS = 5, 3, 40
+
+
+def make(**flags):
+    torch.manual_seed(0)
+    args = ppo.Args(learning_rate=1e-2, **flags)
+    agent = ppo.Agent(OBS, ACT, args).double()
+    with torch.no_grad():
+        agent.actor_mean.weight *= 50  # far from the initial, nearly constant policy
+        agent.actor_logstd += 0.1 * torch.randn(1, ACT)
+    batch = dict(
+        obs=torch.randn(ROWS, OBS).double(),
+        actions=torch.randn(ROWS, ACT).double(),
+        advantages=torch.randn(ROWS).double() * 2 + 1,
+        returns=torch.randn(ROWS).double(),
+        values=torch.randn(ROWS).double(),
+    )
+    with torch.no_grad():
+        old = agent.get_action_and_value(batch["obs"], batch["actions"])[1]
+    batch["logprobs"] = old + 0.3 * torch.randn(ROWS).double()  # ratios on both sides of the clipping range
+    return args, agent, batch
+
+
+def reference_loss(args, agent, b):
+    """From the parameters to the loss, without the agent's own methods."""
+
+    def mlp(layers, x):
+        for layer in layers:
+            if isinstance(layer, torch.nn.Linear):
+                x = torch.tanh(x @ layer.weight.T + layer.bias)
+        return x
+
+    x = b["obs"]
+    if args.norm_obs:
+        x = ((x - agent.obs_mean) / (agent.obs_var + 1e-5).sqrt()).clamp(-10, 10)
+    mean = mlp(agent.actor_features, x) @ agent.actor_mean.weight.T + agent.actor_mean.bias
+    value = (mlp(agent.critic_features, x) @ agent.critic.weight.T + agent.critic.bias)[:, 0]
+    std = agent.actor_logstd.exp()
+    logprob = (-0.5 * ((b["actions"] - mean) / std) ** 2 - agent.actor_logstd - 0.5 * np.log(2 * np.pi)).sum(1)
+    ratio = (logprob - b["logprobs"]).exp()
+    adv = b["advantages"]
+    if args.norm_adv:
+        adv = (adv - adv.mean()) / (((adv - adv.mean()) ** 2).mean().sqrt() + 1e-8)
+    eps = args.clip_coef
+    surrogate = torch.minimum(ratio * adv, ratio.clamp(1 - eps, 1 + eps) * adv).mean()
+    error = (value - b["returns"]) ** 2
+    if args.clip_vloss:
+        clipped = b["values"] + (value - b["values"]).clamp(-eps, eps)
+        error = torch.maximum(error, (clipped - b["returns"]) ** 2)
+    entropy = (agent.actor_logstd + 0.5 * np.log(2 * np.pi * np.e)).sum()
+    metrics = dict(
+        policy_loss=-surrogate,
+        value_loss=0.5 * error.mean(),
+        entropy=entropy,
+        approx_kl=(ratio - 1 - ratio.log()).mean(),
+        clipfrac=((ratio - 1).abs() > eps).double().mean(),
+    )
+    return metrics["policy_loss"] - args.ent_coef * entropy + args.vf_coef * metrics["value_loss"], metrics
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {},
+        dict(norm_adv=False, ent_coef=0.05),
+        dict(clip_vloss=True, vf_coef=2.0, clip_coef=0.1),
+        dict(shared_features=True, max_grad_norm=0.01),
+        dict(norm_obs=True),
+    ],
+)
+def test_one_step(flags):
+    args, agent, batch = make(**flags)
+    agent.update_normalization(batch["obs"])
+    loss, expected = reference_loss(args, agent, batch)
+    parameters = list(agent.parameters())
+    gradients = torch.autograd.grad(loss, parameters)
+    norm = torch.sqrt(sum((g**2).sum() for g in gradients))
+    scale = min(1.0, args.max_grad_norm / (norm.item() + 1e-6))
+    # Adam's first step: the bias-corrected moments are g and g^2
+    wanted = [p.detach() - 1e-2 * g * scale / ((g * scale).abs() + 1e-5) for p, g in zip(parameters, gradients)]
+
+    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-2, eps=1e-5)
+    metrics = ppo.update_minibatch(agent, optimizer, args, **batch)
+
+    for p, w in zip(parameters, wanted):
+        torch.testing.assert_close(p.detach(), w, rtol=1e-6, atol=1e-9)
+    metrics = dict(zip(ppo.UPDATE_METRICS, metrics.tolist()))
+    assert metrics.pop("grad_norm") == pytest.approx(norm.item())
+    assert metrics == pytest.approx({k: v.item() for k, v in expected.items()})
+    assert 0 < metrics["clipfrac"] < 1, "the case must exercise the clipping"
+
+
+def test_minibatch_of_one_row_stays_finite():
+    args, agent, batch = make()
+    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-2)
+    metrics = ppo.update_minibatch(agent, optimizer, args, **{k: v[:1] for k, v in batch.items()})
+    assert metrics.isfinite().all() and all(p.isfinite().all() for p in agent.parameters())
+
+
+def test_running_normalization_equals_statistics_of_all_data():
+    _, agent, _ = make(norm_obs=True)
+    data = torch.randn(300, OBS).double() * torch.tensor([0.1, 1, 10, 100, 0]) + torch.arange(OBS)
+    for part in data.split([10, 200, 90]):
+        agent.update_normalization(part)
+    torch.testing.assert_close(agent.obs_mean, data.mean(0), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(agent.obs_var, data.var(0, correction=0), rtol=1e-3, atol=1e-3)
+
+
+def test_initial_policy_is_nearly_zero_and_deterministic_action_is_its_mean():
+    torch.manual_seed(0)
+    agent = ppo.Agent(OBS, ACT, ppo.Args())
+    obs = torch.randn(64, OBS)
+    assert agent.get_action(obs).abs().max() < 0.1
+    torch.manual_seed(0)
+    samples = torch.stack([agent.get_action_and_value(obs)[0] for _ in range(2000)])
+    torch.testing.assert_close(samples.mean(0), agent.get_action(obs), atol=0.08, rtol=0)
+    assert agent.get_value(obs).shape == (64,)
