@@ -104,10 +104,10 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
-# the two warnings that the replacement makes untrue
-mani_skill.logger.addFilter(
-    lambda record: not re.match("Requested to use render device", record.getMessage())
-)
+
+# what ManiSkill says of no concern here: the render device is replaced above, trajectories are merged on purpose
+UNCONCERNING = ("Requested to use render device", "mani_skill is not installed with git", "Merging", "Conflict detected")
+mani_skill.logger.addFilter(lambda record: not record.getMessage().startswith(UNCONCERNING))
 
 
 @dataclass
@@ -289,7 +289,7 @@ def parse_args(argv: list[str]) -> Args:
     args = tyro.cli(Args, args=argv, default=default)
     args.sim_backend = resolve_backend(args)
     if args.num_steps is None:
-        args.num_steps = max(5, 1600 // args.num_envs) if args.sim_backend == "physx_cpu" else 50
+        args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
     return args
 
 
@@ -299,9 +299,7 @@ def resolve_backend(args: Args) -> str:
     return {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}.get(args.sim_backend, args.sim_backend)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Environments
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Environments ---------------------------------------------------------------------------------------------------
 
 
 def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
@@ -339,7 +337,7 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
                 if evaluation
                 else step // args.num_steps % args.save_train_video_freq == 0
             ),
-            max_steps_per_video=episode_steps(env, args) if evaluation else args.num_steps,
+            max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
             video_fps=base_env.control_freq,
             save_trajectory=trajectory,
             trajectory_name=f"trajectory_{index}",
@@ -349,9 +347,12 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
     return env
 
 
-def episode_steps(env: gym.Env, args: Args) -> int:
-    """The task's time limit; for a task without one, num_eval_steps."""
-    return find_max_episode_steps_value(env) or args.num_eval_steps or 1000
+def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
+    """Number of evaluation episodes, and of steps in each: the task's time limit, or num_eval_steps if it has none."""
+    limit = find_max_episode_steps_value(env)
+    if limit is None or args.num_eval_steps is None:
+        return args.num_eval_episodes, limit or args.num_eval_steps or 1000
+    return args.num_eval_envs * max(1, args.num_eval_steps // limit), limit
 
 
 def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
@@ -363,6 +364,8 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
     torch.set_num_threads(1)
     torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
 
+    envs, streams = [], []
+
     def in_own_stream(i, function, *args, **kwargs):
         torch.set_rng_state(streams[i])
         result = function(*args, **kwargs)
@@ -372,11 +375,20 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
     def batch(infos):
         return {
             k: torch.cat([info[k] for info in infos]).numpy() if isinstance(v, torch.Tensor) else v
-            for k, v in infos[0].items()
+            for k, v in (infos[0].items() if infos else ())
         }
 
+    def reset(rows, seeds=None, options=None):
+        infos = []
+        for i in rows:
+            seed = None if seeds is None else seeds[i]
+            if seed is not None:
+                streams[i] = torch.Generator().manual_seed(seed).get_state()
+            reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
+            infos.append(info)
+        return batch(infos)
+
     try:
-        envs, streams = [], []
         for index in indices:
             torch.manual_seed(index)
             np.random.seed(index)
@@ -385,38 +397,23 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
             conn.send("built")
         spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
         conn.send((spaces, find_max_episode_steps_value(envs[0])))
-        obs, reset_obs, rewards, terminated, truncated, actions = [
-            buffer[indices[0] : indices[-1] + 1] for buffer in conn.recv()
-        ]
+        share = slice(indices[0], indices[-1] + 1)
+        obs, reset_obs, rewards, terminated, truncated, actions = [buffer[share] for buffer in conn.recv()]
         while True:
-            command, *data = conn.recv()
+            command, *arguments = conn.recv()
             if command == "step":
                 results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
                 *tensors, infos = zip(*results)
                 for buffer, rows in zip((obs, rewards, terminated, truncated), tensors):
                     torch.cat(rows, out=buffer)
                 infos = batch(infos)  # before the resets, which write into the same tensors
-                ended = (truncated if ignore_terminations else terminated | truncated).nonzero().flatten().tolist()
-                reset_infos = []
-                for i in ended if auto_reset else []:
-                    reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset)
-                    reset_infos.append(info)
-                conn.send((infos, batch(reset_infos) if reset_infos else None))
-            elif command == "reset":
-                reset_infos = []
-                for i, seed in zip(*data[:2]):
-                    if seed is not None:
-                        streams[i] = torch.Generator().manual_seed(seed).get_state()
-                    reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=data[2])
-                    reset_infos.append(info)
-                conn.send(batch(reset_infos) if reset_infos else None)
+                ended = truncated if ignore_terminations else terminated | truncated
+                conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
             else:
-                for env in envs:
-                    env.close()
-                conn.send("closed")
-                return
-    except (EOFError, BrokenPipeError):
-        pass  # the main process is gone
+                conn.send(reset(*arguments))
+    except (EOFError, ConnectionError):  # the main process closed the pipe, or is gone
+        for env in envs:
+            env.close()
     except BaseException:
         conn.send(RuntimeError(traceback.format_exc()))
 
@@ -442,9 +439,7 @@ class CPUVectorEnv(gym.Env):
     reconfiguration_freq = 0  # as a batch; each environment is a scene of its own and keeps its own frequency
 
     def __init__(self, make_env, num_envs, num_workers, auto_reset=True, ignore_terminations=False, description=""):
-        self.num_envs = num_envs
-        self.metadata = {}
-        self.auto_reset = auto_reset
+        self.num_envs, self.metadata = num_envs, {}
         context = mp.get_context("spawn")
         self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
         self.conns, self.workers = [], []
@@ -511,10 +506,9 @@ class CPUVectorEnv(gym.Env):
         if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
             if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
                 seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
-            chosen = set(env_idx.tolist())
             for conn, share in zip(self.conns, self.shares):
-                rows = [i for i, index in enumerate(share) if index in chosen]
-                conn.send(("reset", rows, [None if seed is None else seed[share[i]] for i in rows], options))
+                rows = [i for i, index in enumerate(share) if (env_idx == index).any()]
+                conn.send(("reset", rows, seed and [seed[index] for index in share], options))
             self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
         infos = self._concatenate([info for info in self.reset_infos if info])
         self.reset_infos = []
@@ -526,15 +520,11 @@ class CPUVectorEnv(gym.Env):
         return self.obs.clone(), dict(infos)
 
     def close(self):
-        for conn, worker in zip(self.conns, self.workers):
-            try:
-                conn.send(("close",))
-                conn.recv()
-            except (EOFError, OSError):
-                pass  # it is gone already
-            worker.join(5)
+        for conn in self.conns:
+            conn.close()  # which is how a worker learns that it is over
+        for worker in self.workers:
+            worker.join(30)
             worker.kill()
-        self.conns, self.workers = [], []
 
 
 def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
@@ -553,9 +543,7 @@ def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSki
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Agent
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Agent ----------------------------------------------------------------------------------------------------------
 
 
 def layer_init(layer: nn.Linear, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Linear:
@@ -625,9 +613,7 @@ class Agent(nn.Module):
         return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Algorithm
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Algorithm ------------------------------------------------------------------------------------------------------
 
 
 def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_horizon=False):
@@ -708,9 +694,7 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Evaluation
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Evaluation -----------------------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -752,9 +736,7 @@ def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
     return centre - half, centre + half
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Checkpoints and results
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Checkpoints and results ----------------------------------------------------------------------------------------
 
 
 def save_checkpoint(path: Path, contents: dict) -> None:
@@ -813,9 +795,7 @@ def plot_learning_curve(run_dir: Path) -> None:
     figure.savefig(run_dir / "learning_curve.png", dpi=120)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Main
-# ---------------------------------------------------------------------------------------------------------------------
+# ----- Main -----------------------------------------------------------------------------------------------------------
 
 
 def check(args: Args) -> None:
@@ -889,13 +869,14 @@ def evaluate_checkpoint(args: Args) -> None:
     envs = make_envs(args, run_dir / "test_videos", evaluation=True)
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0], args).to(device)
     agent.load_state_dict(checkpoint["agent"])
-    episodes = evaluate(agent, envs, args.num_eval_episodes, args.eval_seed, episode_steps(envs, args), device)
+    num_episodes, num_steps = evaluation_size(envs, args)
+    episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
     envs.close()
     merge_recorded(run_dir / "test_videos")
     videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
 
-    results = {"env_id": args.env_id, "num_episodes": args.num_eval_episodes, "eval_seed": args.eval_seed}
-    print(f"{args.env_id}, {args.num_eval_episodes} episodes from seed {args.eval_seed} on, with 95% intervals:")
+    results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
+    print(f"{args.env_id}, {num_episodes} episodes from seed {args.eval_seed} on, with 95% intervals:")
     for key, values in episodes.items():
         low, high = interval(values, rate=key.startswith(("success", "fail")))
         results |= {key: values.mean().item(), f"{key}_interval": [low, high]}
@@ -921,17 +902,16 @@ def train(args: Args) -> None:
     eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
     obs_dim, act_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     low, high = action_bounds(envs, device)
-    max_eval_steps = episode_steps(eval_envs, args)
+    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, args)
 
     agent = Agent(obs_dim, act_dim, args).to(device)
-    critic_only = [] if args.shared_features else list(agent.critic_features.parameters())
-    critic_only += agent.critic.parameters()
-    others = [p for p in agent.parameters() if all(p is not q for q in critic_only)]
+    critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
     groups = [
-        {"params": others, "lr": args.learning_rate},
-        {"params": critic_only, "lr": args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate},
+        dict(
+            params=[p for name, p in agent.named_parameters() if name.startswith("critic") == critic], lr=lr, peak_lr=lr
+        )
+        for critic, lr in ((False, args.learning_rate), (True, critic_lr))
     ]
-    initial_lrs = [group["lr"] for group in groups]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
     if args.checkpoint:
         agent.load_state_dict(load_checkpoint(args.checkpoint)["agent"])
@@ -992,9 +972,9 @@ def train(args: Args) -> None:
             # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
             last = iteration == args.num_iterations
             if last or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0):
-                episodes = evaluate(agent, eval_envs, args.num_eval_episodes, args.eval_seed, max_eval_steps, device)
+                episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device)
                 metrics = {key: value.mean().item() for key, value in episodes.items()}
-                log("eval", metrics | {"num_episodes": args.num_eval_episodes})
+                log("eval", metrics | {"num_episodes": num_eval_episodes})
                 name_videos(run_dir / "videos", f"step_{global_step:09d}")
                 score = [metrics[key] for key in ("success_once", "return") if key in metrics]
                 best = score > best_score
@@ -1044,8 +1024,8 @@ def train(args: Args) -> None:
             # --- update: update_epochs times over the batch, in shuffled minibatches ---
             torch.set_num_threads(num_cores())
             if args.anneal_lr:
-                for group, lr in zip(optimizer.param_groups, initial_lrs):
-                    group["lr"] = lr * (1 - iteration / args.num_iterations)
+                for group in optimizer.param_groups:
+                    group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
             batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
             update_metrics = []
             for epoch in range(args.update_epochs):

@@ -72,9 +72,7 @@ def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
                 obs, info = single.reset(seed=seed + 1)
                 alone.append(flatten(dict(obs=obs, info=info)))
             obs, reward, terminated, truncated, info = single.step(actions[t, i : i + 1])
-            alone.append(
-                flatten(dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info))
-            )
+            alone.append(flatten(dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info)))
         single.close()
         for t, (theirs, ours) in enumerate(zip(alone, pool, strict=True)):
             ended = "info._final_info" in theirs and bool(theirs["info._final_info"])

@@ -123,14 +123,14 @@ def test_metrics_are_means_over_finished_episodes_and_the_whole_update(train, mo
 
     monkeypatch.setattr(batched_env.ManiSkillVectorEnv, "step", spy_step)
     monkeypatch.setattr(ppo, "update_minibatch", spy_update)
-    # 320 / 3 leaves a remainder: all minibatches are equally large all the same
-    metrics, _ = train(total_timesteps=640, num_steps=20, num_minibatches=3, update_epochs=2, reward_scale=0.1)
+    # 960 / 7 leaves a remainder: all minibatches are equally large all the same
+    metrics, _ = train(total_timesteps=960, num_steps=30, num_minibatches=7, update_epochs=2, reward_scale=0.1)
     (row,) = [row for row in metrics if row["kind"] == "train"]
     assert row["return"] == pytest.approx(sum(finished) / len(finished), rel=1e-4)
     assert row["num_episodes"] == len(finished) > 32
     means = torch.stack(updates).mean(0).tolist()
     assert [row[k] for k in ppo.UPDATE_METRICS] == pytest.approx(means, rel=1e-4)
-    assert counted == [640 // 3] * 6
+    assert counted == [960 // 7] * 14
 
 
 def test_target_kl_ends_the_update_and_can_be_off(train):
@@ -149,7 +149,9 @@ def test_target_kl_ends_the_update_and_can_be_off(train):
 
 
 def test_stop_at_success_and_best_checkpoint(train, in_tmp):
-    metrics, last = train(total_timesteps=200_000, stop_at_success=0.5, eval_freq=5, learning_rate=1e-3, update_epochs=8)
+    metrics, last = train(
+        total_timesteps=200_000, stop_at_success=0.5, eval_freq=5, learning_rate=1e-3, update_epochs=8
+    )
     evaluations = [row for row in metrics if row["kind"] == "eval"]
     assert evaluations[-1]["success_once"] >= 0.5 > evaluations[-2]["success_once"]
     best = ppo.load_checkpoint(in_tmp / "runs/run1/best.pt")

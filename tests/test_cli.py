@@ -1,0 +1,268 @@
+"""The script as a command: training, evaluating, filming, refusing."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from conftest import NO_VULKAN, ROOT, run_script
+
+import ppo
+
+TINY = ("--num_envs", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--num_steps", 10, "--total_timesteps", 40,
+        "--num_minibatches", 2, "--no-cuda", "--exp-name", "tiny")  # fmt: skip
+
+
+def inline_metadata(script):
+    """The PEP 723 block of a script, without its comment signs."""
+    block = re.search(r"^# /// script\n((?:#.*\n)+?)# ///$", script.read_text(), re.M).group(1)
+    return "".join(line[2:] if line.startswith("# ") else line[1:] for line in block.splitlines(keepends=True))
+
+
+def test_inline_metadata_equals_pyproject():
+    try:
+        import tomllib
+    except ImportError:
+        import tomli as tomllib
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    script = tomllib.loads(inline_metadata(ROOT / "ppo.py"))
+    assert script == {k: project[k] for k in ("requires-python", "dependencies")}
+
+
+def test_run_folder(trained):
+    folder, process = trained
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    train_rows = [row for row in rows if row["kind"] == "train"]
+    evaluations = [row for row in rows if row["kind"] == "eval"]
+    assert [row["global_step"] for row in train_rows] == [80, 160, 240, 320, 400]
+    assert [row["iteration"] for row in train_rows] == [1, 2, 3, 4, 5]
+    assert [row["global_step"] for row in evaluations] == [0, 160, 320, 400]
+    for row in evaluations:
+        assert row["num_episodes"] == 3 and row["episode_len"] == 50
+        assert 0 <= row["success_at_end"] <= row["success_once"] <= 1 and row["return"] > 0
+    for row in train_rows:
+        assert row["sps"] > 0 and all(math.isfinite(v) for v in row.values() if not isinstance(v, str))
+    about = json.loads((folder / "args.json").read_text())
+    assert about["args"]["num_envs"] == 4 and about["args"]["sim_backend"] == "physx_cpu"
+    assert about["versions"].keys() >= {"mani-skill", "torch", "sapien"} and "--num-steps 20" in about["command"]
+    assert (folder / "learning_curve.png").stat().st_size > 5000
+    assert list(folder.glob("events.out.tfevents.*"))
+    names = {"best.pt", "last.pt", "iteration_2.pt", "iteration_4.pt"}
+    assert {path.name for path in folder.glob("*.pt")} == names and not (folder / "videos").exists()
+    assert "Traceback" not in process.stdout + process.stderr
+    assert process.stderr == "", "without a terminal there is no bar, and no warning concerns the user"
+    assert process.stdout.count("evaluation:") == 4 and "runs/small" in process.stdout
+
+
+def test_tensorboard_holds_the_same_numbers(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, _ = trained
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    for kind, key in (("train", "sps"), ("train", "value_loss"), ("eval", "return")):
+        logged = [(e.step, e.value) for e in events.Scalars(f"{kind}/{key}")]
+        expected = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind]
+        assert [s for s, _ in logged] == [s for s, _ in expected]
+        assert [v for _, v in logged] == pytest.approx([v for _, v in expected])
+
+
+def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path):
+    folder, _ = trained
+    command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video")
+    process = run_script(*command, "--num_eval_episodes", 5, "--eval-seed", 100, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    results = json.loads((folder / "eval.json").read_text())
+    assert results["num_episodes"] == 5 and results["eval_seed"] == 100
+    for key in ("success_once", "success_at_end", "return", "episode_len"):
+        low, high = results[f"{key}_interval"]
+        assert low <= results[key] <= high and f"{results[key]:.3f}" in process.stdout
+    assert not list(tmp_path.iterdir()), "nothing is written but beside the checkpoint"
+    # the last evaluation of the training run, once more
+    process = run_script(*command, "--num_eval_episodes", 3, "--num_eval_envs", 1, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
+    results = json.loads((folder / "eval.json").read_text())
+    assert {k: results[k] for k in ("return", "success_once")} == pytest.approx(
+        {k: last[k] for k in ("return", "success_once")}
+    )
+
+
+def test_wilson_interval():
+    """Reference values of the score interval, to three digits (Newcombe 1998, table I: 81/263, 15/148, 0/20, 1/29)."""
+    for successes, n, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ):
+        values = torch.cat([torch.ones(successes), torch.zeros(n - successes)])
+        assert ppo.interval(values, rate=True) == pytest.approx((low, high), abs=2e-4)
+    values = torch.arange(10.0)
+    half = 1.96 * values.std().item() / 10**0.5
+    assert ppo.interval(values, rate=False) == pytest.approx((4.5 - half, 4.5 + half))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--env_id", "PushCub-v1"), "PushCube-v1"),
+        (("--env_id", "no.such.module:Task-v1"), "no"),
+        (("--num_envs", 0), "num_envs"),
+        (("--num_envs", 2, "--num_steps", 3, "--num_minibatches", 7), "num_minibatches"),
+        (("--total_timesteps", 10, "--num_envs", 4, "--num_steps", 4), "total_timesteps"),
+        (("--sim_backend", "physx_quantum"), "sim_backend"),
+        (("--env_kwargs", "[1]"), "env_kwargs"),
+        (("--evaluate",), "--checkpoint"),
+        (("--evaluate", "--checkpoint", "nowhere.pt"), "nowhere.pt"),
+        (("--evaluate", "--checkpoint", "garbage.pt"), "garbage.pt"),
+        (("--exp-name", "there"), "there"),
+        pytest.param(
+            ("--sim_backend", "physx_cuda"),
+            "CUDA",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has one"),
+        ),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, message, in_tmp, capsys):
+    (in_tmp / "garbage.pt").write_bytes(b"not a checkpoint")
+    (in_tmp / "runs/there").mkdir(parents=True)
+    (in_tmp / "runs/there/metrics.jsonl").touch()
+    before = sorted(in_tmp.rglob("*"))
+    with pytest.raises(SystemExit) as exit:
+        args = ppo.parse_args(["--no-cuda", "--no-capture_video", *map(str, arguments)])
+        ppo.check(args)
+        ppo.train(args)
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and error.count("\n") == 1 and message in error
+    assert sorted(in_tmp.rglob("*")) == before
+
+
+def test_refusal_as_a_command(tmp_path):
+    process = run_script("--env_id", "PickCub-v1", cwd=tmp_path)
+    assert process.returncode == 2 and "PickCube-v1" in process.stderr and process.stderr.count("\n") == 1
+
+
+def test_commands_for_the_peers_scripts_parse():
+    """Flags as ManiSkill's ppo.py and ppo_fast.py and CleanRL's scripts spell them."""
+    args = ppo.parse_args(
+        "--env_id=PushCube-v1 --num_envs=2048 --update_epochs=8 --num_minibatches=32 --total_timesteps=2_000_000 "
+        "--eval_freq=10 --num-steps=20 --seed 5 --gamma=0.99 --gae_lambda 0.95 --no-capture_video --save_trajectory "
+        "--track --wandb_entity me --wandb_project_name P --wandb_group G --cudagraphs --compile --exp-name=x "
+        "--no-torch_deterministic --no-cuda --learning_rate 1e-4 --anneal_lr --no-norm_adv --clip_coef 0.1 --clip_vloss "
+        "--ent_coef 0.01 --vf_coef 1 --max_grad_norm 1 --target_kl None --reward_scale 0.5 --finite_horizon_gae "
+        "--no-partial_reset --eval_partial_reset --reconfiguration_freq 1 --eval_reconfiguration_freq 1 "
+        "--control_mode pd_ee_delta_pose --robot_uids panda --num_eval_envs 4 --num-eval-steps 100 --save-model "
+        "--save_train_video_freq 5 --render_mode all --checkpoint c.pt".split()
+    )
+    assert (args.num_envs, args.num_steps, args.total_timesteps, args.target_kl) == (2048, 20, 2_000_000, None)
+    assert args.anneal_lr and not args.norm_adv and not args.capture_video and args.cudagraphs and args.track
+    assert (args.control_mode, args.batch_size, args.num_iterations) == ("pd_ee_delta_pose", 40960, 48)
+
+
+def test_defaults_by_backend(monkeypatch):
+    args = ppo.parse_args(["--no-cuda"])
+    assert args.sim_backend == "physx_cpu" and args.num_envs == 8 * ppo.num_cores()
+    assert args.batch_size >= args.num_minibatches and args.num_iterations > 10
+    args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
+    assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations > 10
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    args = ppo.parse_args([])
+    assert args.sim_backend == "physx_cuda" and args == replace(ppo.Args(), sim_backend="physx_cuda", num_steps=50)
+    args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
+    assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
+    args = ppo.parse_args(["--sim_backend", "physx_cpu"])
+    assert ppo.choose_device(args) == torch.device("cuda")
+    args = ppo.parse_args(["--sim_backend", "physx_cpu", "--no-cuda"])
+    assert ppo.choose_device(args) == torch.device("cpu")
+
+
+def test_help_shows_every_flag_with_this_machines_defaults(tmp_path):
+    process = run_script("--help", cwd=tmp_path)
+    assert process.returncode == 0
+    for field in ppo.Args.__dataclass_fields__:
+        assert "--" + field.replace("_", "-") in process.stdout or "--" + field in process.stdout
+    assert f"{ppo.parse_args([]).num_envs}" in process.stdout
+
+
+def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
+    process = run_script(*TINY, cwd=tmp_path, env=NO_VULKAN)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("Vulkan") == 1 and "mesa-vulkan-drivers" in process.stdout
+    assert process.stderr == "" and (tmp_path / "runs/tiny/best.pt").exists()
+    assert not (tmp_path / "runs/tiny/videos").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "env_id", ["TwoRobotPickCube-v1", "MS-HopperHop-v1", "RotateValveLevel0-v1", "DrawTriangle-v1"]
+)
+def test_other_kinds_of_task(env_id, tmp_path):
+    """Dict action spaces, tasks without success, other robots, sparse reward: built and trained without Vulkan."""
+    process = run_script(
+        *TINY, "--env_id", env_id, "--env_kwargs", '{"max_episode_steps": 10}', cwd=tmp_path, env=NO_VULKAN
+    )
+    assert process.returncode == 0, process.stderr
+    rows = [json.loads(line) for line in (tmp_path / "runs/tiny/metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
+    assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
+
+
+def test_one_environment_in_this_process(tmp_path):
+    process = run_script(*TINY, "--num_envs", 1, "--num_eval_envs", 1, cwd=tmp_path, env=NO_VULKAN)
+    assert process.returncode == 0, process.stderr
+
+
+@pytest.mark.slow
+def test_weights_do_not_depend_on_evaluation_with_the_pool(tmp_path):
+    """The same through real tasks: one environment in the process, and the pool."""
+    for num_envs in (1, 4):
+        for freq in (1, 0):
+            name = f"{num_envs}-{freq}"
+            flags = (*TINY, "--num_envs", num_envs, "--num_eval_envs", num_envs, "--total_timesteps", 160)
+            process = run_script(*flags, "--exp-name", name, "--eval_freq", freq, cwd=tmp_path, env=NO_VULKAN)
+            assert process.returncode == 0, process.stderr
+        a, b = [ppo.load_checkpoint(tmp_path / f"runs/{num_envs}-{freq}/last.pt")["agent"] for freq in (1, 0)]
+        assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def frames(path):
+    import imageio.v3 as iio
+
+    return iio.imread(path)
+
+
+@pytest.mark.render
+def test_videos_and_trajectories(tmp_path):
+    process = run_script(
+        *TINY, "--env_kwargs", '{"max_episode_steps": 8}', "--save_trajectory", "--save_train_video_freq", 1,
+        "--eval_freq", 1, cwd=tmp_path,
+    )  # fmt: skip
+    assert process.returncode == 0 and process.stderr == "", process.stderr
+    run = tmp_path / "runs/tiny"
+    videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))
+    assert videos == ["step_000000000.mp4", "step_000000020.mp4", "step_000000040.mp4"]
+    assert list((run / "train_videos").glob("*.mp4"))
+    images = frames(run / "videos" / videos[0])
+    assert 8 <= len(images) <= 10 and images.std() > 10, "a filmed scene is not of one colour"
+    # ManiSkill's own tool replays what was recorded, to the same states
+    files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
+    assert files == ["trajectory.h5", "trajectory.json"]
+    episodes = json.loads((run / "videos/trajectory.json").read_text())["episodes"]
+    assert len(episodes) == 6 and {e["elapsed_steps"] for e in episodes} == {8}
+    assert sorted(e["episode_seed"] for e in episodes) == [0, 0, 0, 1, 1, 1]
+    replay = subprocess.run(
+        [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", run / "videos/trajectory.h5",
+         "--sim-backend", "physx_cpu", "--save-traj", "--allow-failure", "--count", "2"],
+        capture_output=True, text=True, stdin=subprocess.DEVNULL, cwd=tmp_path,
+    )  # fmt: skip
+    assert replay.returncode == 0, replay.stderr[-2000:]
+
+    process = run_script("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 2, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert len(frames(run / "test_videos/seed_0.mp4")) >= 8
