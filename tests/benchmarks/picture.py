@@ -1,0 +1,56 @@
+"""Draw the README's picture from finished runs: learning curves over steps and minutes, and frames of a video.
+
+python tests/benchmarks/picture.py OUT.png runs/A runs/B ... --video runs/A/test_videos/seed_1000_0.mp4
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from matplotlib.figure import Figure
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out")
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--metric", default="success_once")
+    parser.add_argument("--video", help="video whose frames are put below the curves")
+    parser.add_argument("--frames", type=int, default=6)
+    options = parser.parse_args()
+
+    figure = Figure(figsize=(10, 5 if options.video else 3.2), layout="constrained")
+    above, *below = figure.subfigures(2, 1, height_ratios=[3, 2]) if options.video else [figure]
+    by_steps, by_minutes = above.subplots(1, 2, sharey=True)
+    for run in options.runs:
+        rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        seconds, points = 0.0, []
+        for row in rows:
+            if row["kind"] == "train":
+                seconds += row["rollout_time"] + row["update_time"]
+            else:
+                points.append((row["global_step"], seconds / 60, row[options.metric]))
+        steps, minutes, values = zip(*points)
+        args = json.loads((run / "args.json").read_text())["args"]
+        for axis, x in ((by_steps, steps), (by_minutes, minutes)):
+            axis.plot(x, values, marker="o", markersize=3, label=f"seed {args['seed']}")
+    by_steps.set(xlabel="environment steps", ylabel=f"{options.metric}, evaluation")
+    by_minutes.set(xlabel="minutes of training (rollout and update)")
+    by_minutes.legend(loc="lower right")
+    for axis in (by_steps, by_minutes):
+        axis.grid(alpha=0.3)
+    above.suptitle(args["env_id"])
+    for subfigure in below:
+        images = iio.imread(options.video)
+        chosen = np.linspace(0, len(images) - 1, options.frames).round().astype(int)
+        for axis, index in zip(subfigure.subplots(1, options.frames), chosen):
+            axis.imshow(images[index])
+            axis.set_title(f"step {index}", fontsize=8)
+            axis.axis("off")
+    figure.savefig(options.out, dpi=100)
+
+
+if __name__ == "__main__":
+    main()

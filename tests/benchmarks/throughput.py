@@ -1,0 +1,143 @@
+"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3 and against simulation alone.
+
+    uv run --group benchmark tests/benchmarks/throughput.py
+
+One run alternates between the candidates, several repetitions of each, and prints medians and spread, since a shared
+machine drifts: compare ratios, not absolute figures. Both learners have the same networks (3 x 256, tanh, one for
+policy and one for value), minibatch size, epochs and batch, and no target KL that would end an update early:
+
+  ppo.py            16 environments in as many worker processes as there are cores
+  SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
+  simulation alone  ppo.py's worker pool driven by actions recorded from the policy: no network, no update
+"""
+
+import argparse
+import os
+import platform
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import ppo
+
+BATCH, MINIBATCHES, EPOCHS = 1600, 8, 8
+
+
+class Ours:
+    """ppo.py's rollout and update, as in its main loop."""
+
+    def __init__(self):
+        flags = f"--no-cuda --num_envs 16 --num_steps 100 --num_minibatches {MINIBATCHES} --update_epochs {EPOCHS}"
+        self.flags = [*flags.split(), "--target_kl", "None", "--no-capture_video"]
+
+    def run(self, iterations):
+        """Returns the medians over iterations of: steps a second, and steps a second of the rollout phase."""
+        import json
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            here = os.getcwd()
+            os.chdir(folder)
+            try:
+                args = ppo.parse_args(
+                    [*self.flags, "--total_timesteps", str(BATCH * iterations), "--exp_name", "x", "--eval_freq", "0",
+                     "--num_eval_envs", "1", "--num_eval_episodes", "1"]
+                )  # fmt: skip
+                stdout, sys.stdout = sys.stdout, open(os.devnull, "w")
+                try:
+                    ppo.train(args)
+                finally:
+                    sys.stdout = stdout
+                lines = Path("runs/x/metrics.jsonl").read_text().splitlines()
+            finally:
+                os.chdir(here)
+        rows = [row for row in map(json.loads, lines) if row["kind"] == "train"][1:]
+        return [row["sps"] for row in rows], [BATCH / row["rollout_time"] for row in rows]
+
+
+def simulation_alone(iterations):
+    """The same pool, in the episodes of an untrained policy, with no learner beside it."""
+    args = ppo.parse_args(["--no-cuda", "--num_envs", "16", "--no-capture_video"])
+    envs = ppo.make_envs(args, Path("unused"))
+    envs.reset(seed=list(range(16)))
+    torch.set_num_threads(1)
+    actions = (0.6 * torch.randn(100, *envs.action_space.shape)).clamp(-1, 1)
+    rates = []
+    for _ in range(iterations):
+        start = time.perf_counter()
+        for action in actions:
+            envs.step(action)
+        rates.append(BATCH / (time.perf_counter() - start))
+    envs.close()
+    return rates[1:]
+
+
+def sb3_env():
+    import mani_skill.envs  # noqa: F401
+    from mani_skill.utils.wrappers import CPUGymWrapper
+
+    torch.set_num_threads(1)
+    env = gym.make("PushCube-v1", obs_mode="state", control_mode="pd_joint_delta_pos", sim_backend="physx_cpu",
+                   render_backend="none")  # fmt: skip
+    return CPUGymWrapper(env)
+
+
+def stable_baselines3(iterations):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    class Timer(BaseCallback):
+        def __init__(self):
+            super().__init__()
+            self.starts = []
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            self.starts.append(time.perf_counter())
+
+    torch.set_num_threads(ppo.num_cores())
+    envs = SubprocVecEnv([sb3_env] * 8, start_method="spawn")
+    network = dict(pi=[256] * 3, vf=[256] * 3)
+    model = PPO("MlpPolicy", envs, n_steps=BATCH // 8, batch_size=BATCH // MINIBATCHES, n_epochs=EPOCHS, gamma=0.8,
+                gae_lambda=0.9, learning_rate=3e-4, max_grad_norm=0.5, device="cpu", seed=1,
+                policy_kwargs=dict(net_arch=network, activation_fn=torch.nn.Tanh))  # fmt: skip
+    timer = Timer()
+    model.learn(BATCH * (iterations + 1), callback=timer)
+    envs.close()
+    return [BATCH / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=8, help="iterations of 1600 steps in each repetition")
+    options = parser.parse_args()
+
+    rates = {"simulation alone": [], "ppo.py": [], "ppo.py, rollout phase": [], "SB3": []}
+    for _ in range(options.repetitions):
+        rates["simulation alone"].append(statistics.median(simulation_alone(options.iterations)))
+        whole, rollout = Ours().run(options.iterations)
+        rates["ppo.py"].append(statistics.median(whole))
+        rates["ppo.py, rollout phase"].append(statistics.median(rollout))
+        rates["SB3"].append(statistics.median(stable_baselines3(options.iterations)))
+
+    print(f"\nPushCube-v1, {ppo.num_cores()} cores of {platform.processor() or platform.machine()}, "
+          f"torch {torch.__version__}; steps/s, median (min to max) of {options.repetitions} repetitions")  # fmt: skip
+    for name, values in rates.items():
+        print(f"  {name:<24}{statistics.median(values):8,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
+    print("ratios, repetition by repetition")
+    for a, b in (("ppo.py", "SB3"), ("ppo.py, rollout phase", "simulation alone"), ("ppo.py", "simulation alone")):
+        ratios = [x / y for x, y in zip(rates[a], rates[b])]
+        print(f"  {a + ' / ' + b:<44}{statistics.median(ratios):6.2f}   ({min(ratios):.2f} to {max(ratios):.2f})")
+
+
+if __name__ == "__main__":
+    main()
