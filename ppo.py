@@ -106,7 +106,12 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
 
 # what ManiSkill says of no concern here: the render device is replaced above, trajectories are merged on purpose
-UNCONCERNING = ("Requested to use render device", "mani_skill is not installed with git", "Merging", "Conflict detected")
+UNCONCERNING = (
+    "Requested to use render device",
+    "mani_skill is not installed with git",
+    "Merging",
+    "Conflict detected",
+)
 mani_skill.logger.addFilter(lambda record: not record.getMessage().startswith(UNCONCERNING))
 
 
@@ -155,8 +160,8 @@ class Args:
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
     """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
-    eval_reconfiguration_freq: Optional[int] = None
-    """rebuild evaluation scenes every so many resets; 1 for tasks that vary their objects"""
+    eval_reconfiguration_freq: Optional[int] = 1
+    """rebuild evaluation scenes every so many resets, for tasks that vary their objects (on a CPU: None)"""
     render_mode: str = "rgb_array"
     """what videos show: rgb_array (the scene), sensors (the task's cameras) or all"""
     shader: str = "default"
@@ -257,7 +262,7 @@ class Args:
 
 CPU_DEFAULTS = dict(
     total_timesteps=150_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    eval_freq=10,
+    eval_freq=10, eval_reconfiguration_freq=None,
 )  # fmt: skip
 
 
@@ -818,6 +823,8 @@ def check(args: Args) -> None:
         fail(
             f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch {torch.__version__} finds none: use physx_cpu"
         )
+    if args.reconfiguration_freq and args.partial_reset and args.num_envs > 1 and args.sim_backend != "physx_cpu":
+        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
     for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes"):
         if getattr(args, flag) < 1:
             fail(f"--{flag} must be at least 1")
@@ -857,7 +864,7 @@ def prepare_rendering(args: Args) -> None:
         args.capture_video, args.save_train_video_freq = False, None
     if RENDER_DEVICE is None and (args.capture_video or args.save_train_video_freq):
         print(
-            "no videos: there is no Vulkan device (a CPU renders with: apt install mesa-vulkan-drivers, Mesa 23.1 on)"
+            "no videos: there is no Vulkan device (to render on a CPU: apt install mesa-vulkan-drivers, Mesa >= 23.1)"
         )
         args.capture_video, args.save_train_video_freq = False, None
 
@@ -886,6 +893,7 @@ def evaluate_checkpoint(args: Args) -> None:
 
 
 def train(args: Args) -> None:
+    """The training run, from the folder to the last checkpoint; the loop stands here in one piece."""
     # --- run folder, seeds, environments, agent ---
     run_name = args.exp_name or f"{args.env_id.split(':')[-1]}__ppo__{args.seed}__{int(time.time())}"
     run_dir = Path("runs") / run_name
@@ -906,12 +914,9 @@ def train(args: Args) -> None:
 
     agent = Agent(obs_dim, act_dim, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
-    groups = [
-        dict(
-            params=[p for name, p in agent.named_parameters() if name.startswith("critic") == critic], lr=lr, peak_lr=lr
-        )
-        for critic, lr in ((False, args.learning_rate), (True, critic_lr))
-    ]
+    critic = [p for name, p in agent.named_parameters() if name.startswith("critic")]
+    actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
+    groups = [{"params": p, "lr": lr, "peak_lr": lr} for p, lr in ((actor, args.learning_rate), (critic, critic_lr))]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
     if args.checkpoint:
         agent.load_state_dict(load_checkpoint(args.checkpoint)["agent"])
@@ -937,9 +942,8 @@ def train(args: Args) -> None:
     metrics_file = open(run_dir / "metrics.jsonl", "a", buffering=1)
     bar = tqdm(total=args.num_iterations * args.batch_size, unit="step", dynamic_ncols=True, disable=None,
                bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}")  # fmt: skip
-    bar.write(
-        f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}, {run_dir}"
-    )
+    bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
+    bar.write(f"writing to {run_dir}")
 
     def log(kind: str, metrics: dict) -> None:
         metrics_file.write(json.dumps({"kind": kind, "global_step": global_step, **metrics}) + "\n")
@@ -947,9 +951,9 @@ def train(args: Args) -> None:
             writer.add_scalar(f"{kind}/{key}", value, global_step)
 
     def checkpoint() -> dict:
-        rng = {"cpu": torch.get_rng_state()} | (
-            {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
-        )
+        rng = {"cpu": torch.get_rng_state()}
+        if device.type == "cuda":
+            rng["cuda"] = torch.cuda.get_rng_state(device)
         return {
             "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "rng": rng, "iteration": iteration,
             "global_step": global_step, "best_score": best_score, "args": asdict(args), "versions": about["versions"],
@@ -985,8 +989,9 @@ def train(args: Args) -> None:
                 if args.save_model:
                     save_checkpoint(run_dir / "last.pt", checkpoint())
                 plot_learning_curve(run_dir)
-                reached = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
-                if last or reached:
+                if last or (
+                    args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
+                ):
                     break
             if args.save_model and args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
                 save_checkpoint(run_dir / f"iteration_{iteration}.pt", checkpoint())
@@ -1029,19 +1034,18 @@ def train(args: Args) -> None:
             batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
             update_metrics = []
             for epoch in range(args.update_epochs):
-                permutation = torch.randperm(args.batch_size, device=device)[
-                    : args.num_minibatches * args.minibatch_size
-                ]
-                for mb_inds in permutation.view(args.num_minibatches, -1):
+                permutation = torch.randperm(args.batch_size, device=device)
+                for i in range(args.num_minibatches):
+                    mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
                     minibatch = [x[mb_inds] for x in batch]
                     update_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
-                epoch_kl = torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean()
-                if args.target_kl is not None and epoch_kl > args.target_kl:
-                    break
+                if args.target_kl is not None:  # the host waits for this number once an epoch
+                    if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
+                        break
             if args.norm_obs:  # after the update, for which the log-probabilities of the rollout must stay valid
                 agent.update_normalization(batch[0])
             torch.set_num_threads(1)
-            explained_variance = 1 - (returns - values).var() / returns.var()
+            explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
 
             # --- log: here alone does the host wait for the device ---
             metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
@@ -1063,7 +1067,7 @@ def train(args: Args) -> None:
             bar.update(args.batch_size)
             if bar.disable and time.monotonic() - last_line > 10:  # no terminal
                 print(
-                    f"step {global_step:>9,}  {metrics['sps']:,.0f} steps/s  training: {summary(metrics)}", flush=True
+                    f"step {global_step:>9,}  training: {metrics['sps']:,.0f} steps/s, {summary(metrics)}", flush=True
                 )
                 last_line = time.monotonic()
     finally:  # also on Ctrl-C or an error: what was learned stays

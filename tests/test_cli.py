@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -266,3 +267,13 @@ def test_videos_and_trajectories(tmp_path):
     process = run_script("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 2, cwd=tmp_path)
     assert process.returncode == 0, process.stderr
     assert len(frames(run / "test_videos/seed_0.mp4")) >= 8
+
+
+@pytest.mark.slow
+def test_the_main_job(tmp_path):
+    """With no flag but the seed: trains, ends by itself, succeeds, and has not collapsed on the way."""
+    process = run_script("--seed", 1, "--exp-name", "main", "--no-cuda", cwd=tmp_path, env=NO_VULKAN, timeout=1200)
+    assert process.returncode == 0, process.stderr
+    rows = [json.loads(line) for line in (tmp_path / "runs/main/metrics.jsonl").read_text().splitlines()]
+    evaluations = [row["success_once"] for row in rows if row["kind"] == "eval"]
+    assert evaluations[0] < 0.2 and evaluations[-1] >= 0.95 and evaluations[-1] >= max(evaluations) - 0.1
