@@ -25,7 +25,6 @@ import difflib
 import importlib
 import importlib.metadata
 import json
-import logging
 import math
 import os
 import platform
@@ -171,7 +170,7 @@ class Args:
 
     # --- PPO ---
     total_timesteps: int = 10_000_000
-    """environment steps in all (on a CPU: 150,000)"""
+    """environment steps in all (on a CPU: 250,000)"""
     learning_rate: float = 3e-4
     """Adam's learning rate (on a CPU: 1e-3)"""
     critic_learning_rate: Optional[float] = None
@@ -217,7 +216,7 @@ class Args:
 
     # --- evaluation and checkpoints ---
     eval_freq: int = 25
-    """evaluate every so many iterations (on a CPU: 10), and always before the first and after the last; 0: only then"""
+    """evaluate every so many iterations (on a CPU: 15), and always before the first and after the last; 0: only then"""
     num_eval_episodes: int = 64
     """episodes of an evaluation"""
     num_eval_steps: Optional[int] = None
@@ -261,8 +260,8 @@ class Args:
 
 
 CPU_DEFAULTS = dict(
-    total_timesteps=150_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    eval_freq=10, eval_reconfiguration_freq=None,
+    total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
+    eval_freq=15, eval_reconfiguration_freq=None,
 )  # fmt: skip
 
 
@@ -312,36 +311,35 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
     `index` tells it from the others and only the first is filmed."""
     video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
     trajectory = evaluation and args.save_trajectory
-    optional = dict(
-        control_mode=args.control_mode,
-        robot_uids=tuple(args.robot_uids.split(",")) if args.robot_uids and "," in args.robot_uids else args.robot_uids,
-        reward_mode=args.reward_mode,
-        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
-        human_render_camera_configs=dict(shader_pack=args.shader) if video else None,
-    )
-    env = gym.make(
-        args.env_id,
+    kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
+        control_mode=args.control_mode,
+        robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
+        reward_mode=args.reward_mode,
+        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
         sim_backend=args.sim_backend,
         render_backend=args.render_backend if video else "none",
         render_mode=args.render_mode if video else None,
-        **{k: v for k, v in optional.items() if v is not None},
-        **json.loads(args.env_kwargs),
+        human_render_camera_configs=dict(shader_pack=args.shader) if video else None,
     )
+    kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
+    env = gym.make(args.env_id, **kwargs)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = FlattenActionSpaceWrapper(env)
     if video or trajectory:
-        base_env, seeds_filmed = env.unwrapped, args.num_eval_envs * (4 if args.evaluate else 1)
+        base_env, rounds_filmed = env.unwrapped, 4 if args.evaluate else 1
+
+        def is_filmed(step):
+            if evaluation:  # its first episodes, which the seeds tell
+                return base_env._episode_seed[0] < args.eval_seed + rounds_filmed * args.num_eval_envs
+            return step // args.num_steps % args.save_train_video_freq == 0
+
         env = RecordEpisode(
             env,
             output_dir=str(record_dir),
             save_video=video,
-            save_video_trigger=lambda step: (
-                base_env._episode_seed[0] < args.eval_seed + seeds_filmed
-                if evaluation
-                else step // args.num_steps % args.save_train_video_freq == 0
-            ),
+            save_video_trigger=is_filmed,
             max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
             video_fps=base_env.control_freq,
             save_trajectory=trajectory,
@@ -812,17 +810,12 @@ def check(args: Args) -> None:
     except ImportError as error:
         fail(f"--env_id {args.env_id}: {error}")
     if name not in REGISTERED_ENVS:
-        nearest = (
-            ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS))
-            or "python -m mani_skill.examples.demo_random_action --help"
-        )
-        fail(f"--env_id {args.env_id}: no such task; the nearest names are: {nearest}")
+        nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
+        fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
     if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
         fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
     if args.sim_backend != "physx_cpu" and not torch.cuda.is_available():
-        fail(
-            f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch {torch.__version__} finds none: use physx_cpu"
-        )
+        fail(f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch finds none: use --sim_backend physx_cpu")
     if args.reconfiguration_freq and args.partial_reset and args.num_envs > 1 and args.sim_backend != "physx_cpu":
         fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
     for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes"):
@@ -832,7 +825,7 @@ def check(args: Args) -> None:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
         fail(
-            f"--total_timesteps {args.total_timesteps} is less than one iteration, num_envs * num_steps = {args.batch_size}"
+            f"--total_timesteps {args.total_timesteps} is less than an iteration, num_envs * num_steps = {args.batch_size}"
         )
     try:
         assert isinstance(json.loads(args.env_kwargs), dict)
@@ -940,8 +933,9 @@ def train(args: Args) -> None:
                    config=about, sync_tensorboard=True, save_code=True)  # fmt: skip
     writer = SummaryWriter(str(run_dir))
     metrics_file = open(run_dir / "metrics.jsonl", "a", buffering=1)
-    bar = tqdm(total=args.num_iterations * args.batch_size, unit="step", dynamic_ncols=True, disable=None,
-               bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}")  # fmt: skip
+    bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+    total = args.num_iterations * args.batch_size
+    bar = tqdm(total=total, dynamic_ncols=True, disable=None, bar_format=bar_format)
     bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
     bar.write(f"writing to {run_dir}")
 
@@ -1033,7 +1027,7 @@ def train(args: Args) -> None:
                     group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
             batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
             update_metrics = []
-            for epoch in range(args.update_epochs):
+            for _ in range(args.update_epochs):
                 permutation = torch.randperm(args.batch_size, device=device)
                 for i in range(args.num_minibatches):
                     mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
