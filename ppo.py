@@ -18,12 +18,13 @@ Watch     runs/NAME/videos/*.mp4, runs/NAME/learning_curve.png, tensorboard --lo
 Help      python ppo.py --help
 
 The same command runs on a GPU, on a CPU and without a renderer. `uv run ppo.py` installs what it needs.
-To make it yours: the network is `Agent`, the numbers are `Args`, the algorithm is `main`, top to bottom.
+To make it yours: the network is `Agent`, the numbers are `Args`, the algorithm is `train`, top to bottom.
 """
 
+import contextlib
 import difflib
-import importlib
 import importlib.metadata
+import importlib.util
 import json
 import math
 import os
@@ -41,7 +42,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, NoReturn, Optional
 
-warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # reported once, by main, in plain words
+# Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
+warnings.filterwarnings("ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision")
 
 import gymnasium as gym
 import numpy as np
@@ -85,6 +87,7 @@ if RENDER_DEVICE is None:
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
 from mani_skill.trajectory.merge_trajectory import merge_trajectories
+from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper
@@ -97,21 +100,17 @@ parse_backends = sapien_env.parse_sim_and_render_backend
 def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
     """ManiSkill's render_backend has no name for a Vulkan device without CUDA: put it in where CUDA is not found."""
     backend = parse_backends(sim_backend, render_backend)
-    if backend.render_device is not None and not backend.render_device.can_render():
-        backend.render_device = RENDER_DEVICE or backend.render_device
+    if RENDER_DEVICE and backend.render_device and not backend.render_device.can_render():
+        backend.render_device, backend.render_backend = RENDER_DEVICE, "sapien_cpu"
     return backend
 
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
 
-# what ManiSkill says of no concern here: the render device is replaced above, trajectories are merged on purpose
-UNCONCERNING = (
-    "Requested to use render device",
-    "mani_skill is not installed with git",
-    "Merging",
-    "Conflict detected",
-)
-mani_skill.logger.addFilter(lambda record: not record.getMessage().startswith(UNCONCERNING))
+# what concerns no user: the render device is replaced above, trajectories are merged on purpose, robots are as they are
+NOISE = "Requested to use render device|mani_skill is not installed with git|Merging|Conflict detected|"
+NOISE += "Currently ManiSkill does not support loading plane|No initial pose set for"
+mani_skill.logger.addFilter(lambda record: not re.match(NOISE, record.getMessage()))
 
 
 @dataclass
@@ -144,7 +143,7 @@ class Args:
     robot_uids: Optional[str] = None
     """robot (None: the task's own)"""
     reward_mode: Optional[str] = None
-    """normalized_dense, dense, sparse or none (None: the first of these that the task has)"""
+    """normalized_dense, dense or sparse (None: the first of these that the task has)"""
     sim_backend: str = "auto"
     """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
     render_backend: str = "gpu"
@@ -159,12 +158,12 @@ class Args:
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
     """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
-    eval_reconfiguration_freq: Optional[int] = 1
-    """rebuild evaluation scenes every so many resets, for tasks that vary their objects (on a CPU: None)"""
+    eval_reconfiguration_freq: Optional[int] = None
+    """rebuild evaluation scenes every so many resets; 1 suits tasks that vary their objects"""
     render_mode: str = "rgb_array"
     """what videos show: rgb_array (the scene), sensors (the task's cameras) or all"""
     shader: str = "default"
-    """shader pack of videos: minimal, default, rt-fast or rt"""
+    """shader pack of videos: minimal or default; with CPU simulation rt-fast and rt (ray tracing) too"""
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"enhanced_determinism": true}'"""
 
@@ -236,7 +235,7 @@ class Args:
     capture_video: bool = True
     """film the first episodes of each evaluation, where there is a renderer"""
     save_train_video_freq: Optional[int] = None
-    """film the training environments every so many iterations"""
+    """film training every so many iterations (on a GPU all environments, as tiles: keep num_envs small)"""
     save_trajectory: bool = False
     """write the evaluation episodes as ManiSkill trajectories, beside the videos"""
 
@@ -261,7 +260,7 @@ class Args:
 
 CPU_DEFAULTS = dict(
     total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    eval_freq=15, eval_reconfiguration_freq=None,
+    eval_freq=15,
 )  # fmt: skip
 
 
@@ -281,15 +280,19 @@ def parse_args(argv: list[str]) -> Args:
     args = tyro.cli(Args, args=[arg for arg in argv if arg not in ("-h", "--help")])
     args.sim_backend = resolve_backend(args)
     default = Args()
-    if args.evaluate:
+    if args.evaluate or args.checkpoint:
         stored = load_checkpoint(args.checkpoint)["args"]
+        network = {k: stored[k] for k in ("norm_obs", "shared_features")}
         machine = ("cuda", "sim_backend", "render_backend", "num_eval_envs", "num_eval_episodes", "num_eval_steps",
-                   "eval_seed", "capture_video", "save_trajectory")  # fmt: skip
+                   "eval_seed", "capture_video", "save_trajectory", "track")  # fmt: skip
+    if args.evaluate:
         default = replace(default, **{k: v for k, v in stored.items() if hasattr(default, k) and k not in machine})
+    elif args.sim_backend == "physx_cpu":
+        default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores())
     if args.sim_backend == "physx_cpu":
         default.num_eval_envs = 4 * num_cores()
-        if not args.evaluate:
-            default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores())
+    if args.checkpoint:
+        default = replace(default, **network)
     args = tyro.cli(Args, args=argv, default=default)
     args.sim_backend = resolve_backend(args)
     if args.num_steps is None:
@@ -311,12 +314,13 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
     `index` tells it from the others and only the first is filmed."""
     video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
     trajectory = evaluation and args.save_trajectory
+    modes = REGISTERED_ENVS[args.env_id.split(":")[-1]].cls.SUPPORTED_REWARD_MODES
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
         control_mode=args.control_mode,
         robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
-        reward_mode=args.reward_mode,
+        reward_mode=args.reward_mode or next((m for m in ("normalized_dense", "dense", "sparse") if m in modes), None),
         reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
         sim_backend=args.sim_backend,
         render_backend=args.render_backend if video else "none",
@@ -340,6 +344,7 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
             output_dir=str(record_dir),
             save_video=video,
             save_video_trigger=is_filmed,
+            save_on_reset=evaluation,
             max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
             video_fps=base_env.control_freq,
             save_trajectory=trajectory,
@@ -358,12 +363,17 @@ def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
     return args.num_eval_envs * max(1, args.num_eval_steps // limit), limit
 
 
+def stream_seed(seed: int) -> int:
+    """Seed of the random stream from which episodes without a seed follow one with `seed`. ManiSkill draws that one
+    from `seed` itself, so the others need a different one; like all seeds of training it is at least 2^31."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0]) | 2**31
+
+
 def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
     """Body of a worker process: build the environments `indices`, then answer each message with one message.
 
     Each environment has its own stream of torch random numbers, so that its episodes depend on neither its neighbours
     nor the number of workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process to handle
     torch.set_num_threads(1)
     torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
 
@@ -386,7 +396,7 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
         for i in rows:
             seed = None if seeds is None else seeds[i]
             if seed is not None:
-                streams[i] = torch.Generator().manual_seed(seed).get_state()
+                streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
             reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
             infos.append(info)
         return batch(infos)
@@ -403,7 +413,10 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
         share = slice(indices[0], indices[-1] + 1)
         obs, reset_obs, rewards, terminated, truncated, actions = [buffer[share] for buffer in conn.recv()]
         while True:
-            command, *arguments = conn.recv()
+            try:
+                command, *arguments = conn.recv()
+            except (EOFError, ConnectionError):  # the main process closed the pipe, or is gone
+                break
             if command == "step":
                 results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
                 *tensors, infos = zip(*results)
@@ -414,7 +427,6 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
                 conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
             else:
                 conn.send(reset(*arguments))
-    except (EOFError, ConnectionError):  # the main process closed the pipe, or is gone
         for env in envs:
             env.close()
     except BaseException:
@@ -446,6 +458,7 @@ class CPUVectorEnv(gym.Env):
         context = mp.get_context("spawn")
         self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
         self.conns, self.workers = [], []
+        on_ctrl_c = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: Ctrl-C is for the main process alone
         for share in self.shares:
             conn, worker_conn = context.Pipe()
             worker = context.Process(
@@ -455,6 +468,7 @@ class CPUVectorEnv(gym.Env):
             worker_conn.close()  # so that a dead worker reads as the end of its pipe
             self.conns.append(conn)
             self.workers.append(worker)
+        signal.signal(signal.SIGINT, on_ctrl_c)
         with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
             for i in range(len(self.shares[0])):
                 for w, share in enumerate(self.shares):
@@ -470,9 +484,13 @@ class CPUVectorEnv(gym.Env):
         self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions = buffers
         for buffer in buffers:
             buffer.share_memory_()
-        for conn in self.conns:
-            conn.send(buffers)
+        self._send([buffers] * len(self.conns))
         self.infos, self.reset_infos = {}, []
+
+    def _send(self, messages):
+        for conn, message in zip(self.conns, messages):
+            with contextlib.suppress(ConnectionError):  # _receive tells what became of the worker
+                conn.send(message)
 
     def _receive(self, w):
         try:
@@ -497,8 +515,7 @@ class CPUVectorEnv(gym.Env):
 
     def step(self, actions: torch.Tensor):
         self.actions.copy_(actions)
-        for conn in self.conns:
-            conn.send(("step",))
+        self._send([("step",)] * len(self.conns))
         infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
         self.infos = self._concatenate(infos)
         return self.obs.clone(), self.rewards.clone(), self.terminated.clone(), self.truncated.clone(), dict(self.infos)
@@ -509,9 +526,9 @@ class CPUVectorEnv(gym.Env):
         if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
             if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
                 seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
-            for conn, share in zip(self.conns, self.shares):
-                rows = [i for i, index in enumerate(share) if (env_idx == index).any()]
-                conn.send(("reset", rows, seed and [seed[index] for index in share], options))
+            chosen = [[i for i, index in enumerate(share) if (env_idx == index).any()] for share in self.shares]
+            seeds = [seed and [seed[index] for index in share] for share in self.shares]
+            self._send([("reset", rows, s, options) for rows, s in zip(chosen, seeds)])
             self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
         infos = self._concatenate([info for info in self.reset_infos if info])
         self.reset_infos = []
@@ -812,15 +829,22 @@ def check(args: Args) -> None:
     if name not in REGISTERED_ENVS:
         nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
         fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
+    missing = [a for a in expand_data_group_into_individual_data_source_ids(name) if not is_data_source_downloaded(a)]
+    if missing:
+        fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {name}")
     if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
         fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
     if args.sim_backend != "physx_cpu" and not torch.cuda.is_available():
         fail(f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch finds none: use --sim_backend physx_cpu")
-    if args.reconfiguration_freq and args.partial_reset and args.num_envs > 1 and args.sim_backend != "physx_cpu":
+    if args.reconfiguration_freq and args.partial_reset and args.sim_backend != "physx_cpu" and not args.evaluate:
         fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
     for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes"):
         if getattr(args, flag) < 1:
             fail(f"--{flag} must be at least 1")
+    if not 0 <= args.eval_seed < 2**31 - args.num_eval_episodes - args.num_eval_envs:
+        fail("--eval_seed must be at least 0, and the seeds of all evaluation episodes below 2^31")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        fail("--track needs Weights & Biases: pip install wandb")
     if args.batch_size < args.num_minibatches:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
@@ -830,7 +854,7 @@ def check(args: Args) -> None:
     try:
         assert isinstance(json.loads(args.env_kwargs), dict)
     except (ValueError, AssertionError):
-        fail(f"--env_kwargs must be a JSON object such as '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
+        fail(f"--env_kwargs must be a JSON object like '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
 
 
 def choose_device(args: Args) -> torch.device:
@@ -852,13 +876,15 @@ def action_bounds(envs, device) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def prepare_rendering(args: Args) -> None:
-    """Switch videos off, with one line, where nothing can render them."""
+    """Render on the GPU that simulates; switch videos off, with one line, where nothing can render them."""
+    on_gpu = args.sim_backend != "physx_cpu"
+    if on_gpu and args.render_backend == "gpu":
+        args.render_backend = args.sim_backend.replace("physx_cuda", "gpu")
     if args.render_backend == "none":
         args.capture_video, args.save_train_video_freq = False, None
-    if RENDER_DEVICE is None and (args.capture_video or args.save_train_video_freq):
-        print(
-            "no videos: there is no Vulkan device (to render on a CPU: apt install mesa-vulkan-drivers, Mesa >= 23.1)"
-        )
+    elif RENDER_DEVICE is None or (on_gpu and not RENDER_DEVICE.is_cuda()):
+        if args.capture_video or args.save_train_video_freq:
+            print("no videos: no Vulkan device can render them (the README's troubleshooting says how to get one)")
         args.capture_video, args.save_train_video_freq = False, None
 
 
@@ -866,6 +892,7 @@ def evaluate_checkpoint(args: Args) -> None:
     """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
     checkpoint = load_checkpoint(args.checkpoint)
     run_dir, device = Path(args.checkpoint).parent, choose_device(args)
+    torch.set_num_threads(1)
     envs = make_envs(args, run_dir / "test_videos", evaluation=True)
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0], args).to(device)
     agent.load_state_dict(checkpoint["agent"])
@@ -876,7 +903,7 @@ def evaluate_checkpoint(args: Args) -> None:
     videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
 
     results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
-    print(f"{args.env_id}, {num_episodes} episodes from seed {args.eval_seed} on, with 95% intervals:")
+    print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {args.eval_seed} on, 95% intervals:")
     for key, values in episodes.items():
         low, high = interval(values, rate=key.startswith(("success", "fail")))
         results |= {key: values.mean().item(), f"{key}_interval": [low, high]}
@@ -967,6 +994,9 @@ def train(args: Args) -> None:
 
     try:
         for iteration in range(args.num_iterations + 1):  # the number of finished updates
+            if args.save_model and args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
+                save_checkpoint(run_dir / f"iteration_{iteration}.pt", checkpoint())
+
             # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
             last = iteration == args.num_iterations
             if last or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0):
@@ -987,8 +1017,6 @@ def train(args: Args) -> None:
                     args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
                 ):
                     break
-            if args.save_model and args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
-                save_checkpoint(run_dir / f"iteration_{iteration}.pt", checkpoint())
 
             # --- rollout: num_steps in every environment ---
             start = time.perf_counter()
@@ -1011,7 +1039,6 @@ def train(args: Args) -> None:
                     for key, value in infos["final_info"]["episode"].items():
                         total = torch.where(done, value.to(device).float(), 0.0).sum()
                         episode_sums[key] = episode_sums.get(key, 0.0) + total
-            global_step += args.batch_size
             with torch.no_grad():
                 following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
             next_values = torch.where(dones.bool(), next_values, following)
@@ -1041,6 +1068,8 @@ def train(args: Args) -> None:
             torch.set_num_threads(1)
             explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
 
+            global_step += args.batch_size
+
             # --- log: here alone does the host wait for the device ---
             metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
             if episode_sums:
@@ -1065,16 +1094,17 @@ def train(args: Args) -> None:
                 )
                 last_line = time.monotonic()
     finally:  # also on Ctrl-C or an error: what was learned stays
-        if args.save_model and global_step > 0:
-            save_checkpoint(run_dir / "last.pt", checkpoint())
         bar.close()
         writer.close()
         metrics_file.close()
         envs.close()
         eval_envs.close()
-        merge_recorded(run_dir / "videos")
-    print(f"learning curve, videos, metrics and checkpoints are in {run_dir}; evaluate the best policy once more with")
-    print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'}")
+        if args.save_model and global_step > 0:
+            save_checkpoint(run_dir / "last.pt", checkpoint())
+    merge_recorded(run_dir / "videos")
+    print(f"learning curve, metrics and whatever else was asked for are in {run_dir}")
+    if args.save_model:
+        print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'}")
 
 
 if __name__ == "__main__":

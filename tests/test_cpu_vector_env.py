@@ -16,21 +16,6 @@ ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=3, capture_video=False)
 SEEDS = [7, 2**31 + 5, 123]
 
 
-def record(envs, actions, reseed_at):
-    """Everything that envs return over the actions, as a list of flat dicts of cloned tensors."""
-    steps = []
-    obs, info = envs.reset(seed=SEEDS[: envs.num_envs] if envs.num_envs > 1 else envs.seeds)
-    steps.append(flatten(dict(obs=obs, info=info)))
-    for t, action in enumerate(actions):
-        if t == reseed_at:
-            obs, info = envs.reset(seed=[s + 1 for s in (SEEDS if envs.num_envs > 1 else envs.seeds)])
-            steps.append(flatten(dict(obs=obs, info=info)))
-        obs, reward, terminated, truncated, info = envs.step(action)
-        step = dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info)
-        steps.append(flatten(step))
-    return steps
-
-
 def flatten(tree, prefix=""):
     flat = {}
     for k, v in tree.items():
@@ -41,38 +26,42 @@ def flatten(tree, prefix=""):
     return flat
 
 
+def play(envs, seeds, actions, before_reset=lambda seeds: None):
+    """Everything that reset and step return, with a second seeded reset on the way: a list of flat dicts."""
+    steps = []
+    for t, action in enumerate(actions):
+        if t in (0, 40):
+            seeds = [seed + t for seed in seeds]
+            before_reset(seeds)
+            obs, info = envs.reset(seed=seeds)
+            steps.append(flatten(dict(obs=obs, info=info)))
+        obs, reward, terminated, truncated, info = envs.step(action)
+        step = dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info)
+        steps.append(flatten(step))
+    return steps
+
+
 @pytest.mark.parametrize("partial_reset", [True, False])
 @pytest.mark.parametrize("env_id", ["PushCube-v1", "PickCube-v1", "MS-CartpoleBalance-v1", "RollBall-v1"])
 def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
     """Episodes end by success or failure at different times, and by the time limit; then the environments reset
     themselves from their own random streams."""
     args = replace(ARGS, env_id=env_id, partial_reset=partial_reset, env_kwargs='{"max_episode_steps": 15}')
-    generator = torch.Generator().manual_seed(0)
     envs = ppo.make_envs(args, tmp_path)
     try:
-        actions = 2 * torch.rand(70, 3, *envs.single_action_space.shape, generator=generator) - 1
+        actions = torch.rand(70, 3, *envs.single_action_space.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
         if env_id == "MS-CartpoleBalance-v1":
             actions = actions.sign()  # so that the pole falls
-        pool = record(envs, actions, reseed_at=40)
+        pool = play(envs, SEEDS, actions)
     finally:
         envs.close()
-    ended_at = set()
+    ended_at, first_observations = set(), []
     for i, seed in enumerate(SEEDS):
-        torch.manual_seed(seed)  # the pool gives each environment a stream that starts from its seed
         single = ppo.make_envs(replace(args, num_envs=1), tmp_path)
-        assert type(single.base_env).__name__ != "CPUVectorEnv"
-        single.seeds = [seed]
-        torch.manual_seed(seed)
-        alone = []
-        obs, info = single.reset(seed=seed)
-        alone.append(flatten(dict(obs=obs, info=info)))
-        for t in range(70):
-            if t == 40:
-                torch.manual_seed(seed + 1)
-                obs, info = single.reset(seed=seed + 1)
-                alone.append(flatten(dict(obs=obs, info=info)))
-            obs, reward, terminated, truncated, info = single.step(actions[t, i : i + 1])
-            alone.append(flatten(dict(obs=obs, reward=reward, terminated=terminated, truncated=truncated, info=info)))
+        assert not isinstance(single.base_env, ppo.CPUVectorEnv)
+        # the pool's environments continue from a random stream of their own, which their seed determines
+        stream = lambda seeds: torch.manual_seed(ppo.stream_seed(seeds[0]))
+        alone = play(single, [seed], actions[:, i : i + 1], before_reset=stream)
         single.close()
         for t, (theirs, ours) in enumerate(zip(alone, pool, strict=True)):
             ended = "info._final_info" in theirs and bool(theirs["info._final_info"])
@@ -80,11 +69,16 @@ def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
                 ended_at.add((i, t))
                 assert theirs.keys() == ours.keys()
                 assert not torch.equal(ours["info.final_observation"][i], ours["obs"][i])
+            if ended or t == 0:
+                first_observations.append(ours["obs"][i])
             # where another environment of the pool ended, it also has final_... entries of this one
             for key in theirs.keys() if ended or "info._final_info" not in ours else theirs.keys() & ours.keys():
                 assert torch.equal(theirs[key][0], ours[key][i]), (i, t, key)
                 assert theirs[key].dtype == ours[key].dtype
     assert len(ended_at) >= 6, "several episodes must end"
+    assert len(torch.stack(first_observations).unique(dim=0)) == len(first_observations), (
+        "no episode starts like another"
+    )
 
 
 def test_independent_of_number_of_workers(tmp_path):
