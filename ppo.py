@@ -43,7 +43,9 @@ from pathlib import Path
 from typing import Literal, NoReturn, Optional
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
-warnings.filterwarnings("ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision")
+warnings.filterwarnings(
+    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision"
+)
 
 import gymnasium as gym
 import numpy as np

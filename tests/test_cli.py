@@ -149,7 +149,7 @@ def test_refusal_as_a_command(tmp_path):
     assert process.returncode == 2 and "PickCube-v1" in process.stderr and process.stderr.count("\n") == 1
 
 
-def test_commands_for_the_peers_scripts_parse():
+def test_commands_for_the_peers_scripts_parse(trained):
     """Flags as ManiSkill's ppo.py and ppo_fast.py and CleanRL's scripts spell them."""
     args = ppo.parse_args(
         "--env_id=PushCube-v1 --num_envs=2048 --update_epochs=8 --num_minibatches=32 --total_timesteps=2_000_000 "
@@ -159,10 +159,11 @@ def test_commands_for_the_peers_scripts_parse():
         "--ent_coef 0.01 --vf_coef 1 --max_grad_norm 1 --target_kl None --reward_scale 0.5 --finite_horizon_gae "
         "--no-partial_reset --eval_partial_reset --reconfiguration_freq 1 --eval_reconfiguration_freq 1 "
         "--control_mode pd_ee_delta_pose --robot_uids panda --num_eval_envs 4 --num-eval-steps 100 --save-model "
-        "--save_train_video_freq 5 --render_mode all --checkpoint c.pt".split()
+        f"--save_train_video_freq 5 --render_mode all --checkpoint {trained[0] / 'last.pt'}".split()
     )
     assert (args.num_envs, args.num_steps, args.total_timesteps, args.target_kl) == (2048, 20, 2_000_000, None)
     assert args.anneal_lr and not args.norm_adv and not args.capture_video and args.cudagraphs and args.track
+    assert args.norm_obs, "the network that the checkpoint was trained with"
     assert (args.control_mode, args.batch_size, args.num_iterations) == ("pd_ee_delta_pose", 40960, 48)
 
 
@@ -222,7 +223,12 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
 
     main_end, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 120, 0, 0))
-    command = [sys.executable, str(ROOT / "ppo.py"), *map(str, TINY), "--eval_freq", "1"]
+    command = [
+        sys.executable,
+        str(ROOT / "ppo.py"),
+        *map(str, TINY),
+        *"--num_steps 50 --total_timesteps 200 --eval_freq 1".split(),
+    ]
     process = subprocess.Popen(
         command, cwd=tmp_path, env={**os.environ, **NO_VULKAN}, stdin=terminal, stdout=terminal, stderr=terminal
     )
