@@ -417,7 +417,7 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
         while True:
             try:
                 command, *arguments = conn.recv()
-            except (EOFError, ConnectionError):  # the main process closed the pipe, or is gone
+            except EOFError:  # the main process closed the pipe
                 break
             if command == "step":
                 results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
@@ -429,10 +429,12 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
                 conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
             else:
                 conn.send(reset(*arguments))
-        for env in envs:
-            env.close()
+    except ConnectionError:
+        pass  # it did so while it was to be answered, or is gone
     except BaseException:
         conn.send(RuntimeError(traceback.format_exc()))
+    for env in envs:
+        env.close()
 
 
 class CPUVectorEnv(gym.Env):
@@ -886,7 +888,12 @@ def prepare_rendering(args: Args) -> None:
         args.capture_video, args.save_train_video_freq = False, None
     elif RENDER_DEVICE is None or (on_gpu and not RENDER_DEVICE.is_cuda()):
         if args.capture_video or args.save_train_video_freq:
-            print("no videos: no Vulkan device can render them (the README's troubleshooting says how to get one)")
+            how = (
+                "NVIDIA_DRIVER_CAPABILITIES=all in a container"
+                if on_gpu
+                else "apt install mesa-vulkan-drivers (>= 23.1)"
+            )
+            print(f"no videos: there is no Vulkan device to render them (to get one: {how})")
         args.capture_video, args.save_train_video_freq = False, None
 
 
@@ -1104,9 +1111,8 @@ def train(args: Args) -> None:
         if args.save_model and global_step > 0:
             save_checkpoint(run_dir / "last.pt", checkpoint())
     merge_recorded(run_dir / "videos")
-    print(f"learning curve, metrics and whatever else was asked for are in {run_dir}")
-    if args.save_model:
-        print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'}")
+    print(f"learning curve, videos and metrics are in {run_dir}; to evaluate the best policy on other episodes:")
+    print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
 
 
 if __name__ == "__main__":
