@@ -852,9 +852,7 @@ def check(args: Args) -> None:
     if args.batch_size < args.num_minibatches:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
-        fail(
-            f"--total_timesteps {args.total_timesteps} is less than an iteration, num_envs * num_steps = {args.batch_size}"
-        )
+        fail(f"--total_timesteps {args.total_timesteps} is less than one iteration of {args.batch_size} steps")
     try:
         assert isinstance(json.loads(args.env_kwargs), dict)
     except (ValueError, AssertionError):

@@ -155,8 +155,8 @@ def test_commands_for_the_peers_scripts_parse(trained):
         "--env_id=PushCube-v1 --num_envs=2048 --update_epochs=8 --num_minibatches=32 --total_timesteps=2_000_000 "
         "--eval_freq=10 --num-steps=20 --seed 5 --gamma=0.99 --gae_lambda 0.95 --no-capture_video --save_trajectory "
         "--track --wandb_entity me --wandb_project_name P --wandb_group G --cudagraphs --compile --exp-name=x "
-        "--no-torch_deterministic --no-cuda --learning_rate 1e-4 --anneal_lr --no-norm_adv --clip_coef 0.1 --clip_vloss "
-        "--ent_coef 0.01 --vf_coef 1 --max_grad_norm 1 --target_kl None --reward_scale 0.5 --finite_horizon_gae "
+        "--no-torch_deterministic --no-cuda --learning_rate 1e-4 --anneal_lr --no-norm_adv --clip_coef 0.1 "
+        "--clip_vloss --ent_coef 0.01 --vf_coef 1 --max_grad_norm 1 --target_kl None --reward_scale 0.5 --finite_horizon_gae "
         "--no-partial_reset --eval_partial_reset --reconfiguration_freq 1 --eval_reconfiguration_freq 1 "
         "--control_mode pd_ee_delta_pose --robot_uids panda --num_eval_envs 4 --num-eval-steps 100 --save-model "
         f"--save_train_video_freq 5 --render_mode all --checkpoint {trained[0] / 'last.pt'}".split()
