@@ -53,7 +53,8 @@ def trained(tmp_path_factory):
     shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own
     process = run_script(
         "--exp-name", "small", "--num_envs", "4", "--num-eval-envs", "2", "--num_eval_episodes", "3",
-        "--num-steps", "20", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2", "--no-capture_video", "--no-cuda",
+        "--num-steps", "20", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
+        "--no-capture_video", "--no-cuda",
         cwd=folder, script=folder / "ppo.py",
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
