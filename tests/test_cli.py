@@ -159,7 +159,8 @@ def test_commands_for_the_peers_scripts_parse(trained):
         "--clip_vloss --ent_coef 0.01 --vf_coef 1 --max_grad_norm 1 --target_kl None --reward_scale 0.5 "
         "--finite_horizon_gae --no-partial_reset --eval_partial_reset --reconfiguration_freq 1 "
         "--eval_reconfiguration_freq 1 --control_mode pd_ee_delta_pose --robot_uids panda --num_eval_envs 4 "
-        f"--num-eval-steps 100 --save-model --save_train_video_freq 5 --render_mode all --checkpoint {trained[0] / 'last.pt'}".split()
+        "--num-eval-steps 100 --save-model --save_train_video_freq 5 --render_mode all "
+        f"--checkpoint {trained[0] / 'last.pt'}".split()
     )
     assert (args.num_envs, args.num_steps, args.total_timesteps, args.target_kl) == (2048, 20, 2_000_000, None)
     assert args.anneal_lr and not args.norm_adv and not args.capture_video and args.cudagraphs and args.track
