@@ -8,7 +8,7 @@ policy and one for value), minibatch size, epochs and batch, and no target KL th
 
   ppo.py            16 environments in as many worker processes as there are cores
   SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
-  simulation alone  ppo.py's worker pool driven by actions recorded from the policy: no network, no update
+  simulation alone  ppo.py's worker pool driven by random actions as noisy as an untrained policy's: no learner
 """
 
 import argparse
@@ -61,7 +61,7 @@ class Ours:
 
 
 def simulation_alone(iterations):
-    """The same pool, in the episodes of an untrained policy, with no learner beside it."""
+    """The same pool under random actions, with no learner beside it."""
     args = ppo.parse_args(["--no-cuda", "--num_envs", "16", "--no-capture_video"])
     envs = ppo.make_envs(args, Path("unused"))
     envs.reset(seed=list(range(16)))
