@@ -8,11 +8,13 @@
 #     "tensorboard>=2.16,<3",
 #     "tyro>=0.9,<2",
 #     "matplotlib>=3.8,<4",
+#     "psutil>=5.9,<8",
 # ]
 # ///
 """PPO for ManiSkill from state observations, in one file.
 
 Train     python ppo.py --env_id PushCube-v1
+Resume    python ppo.py --resume runs/NAME
 Evaluate  python ppo.py --evaluate --checkpoint runs/NAME/best.pt
 Watch     runs/NAME/videos/*.mp4, runs/NAME/learning_curve.png, tensorboard --logdir runs
 Help      python ppo.py --help
@@ -22,9 +24,13 @@ To make it yours: the network is `Agent`, the numbers are `Args`, the algorithm 
 """
 
 import contextlib
+import copy
 import difflib
+import gc
 import importlib.metadata
 import importlib.util
+import inspect
+import io
 import json
 import math
 import os
@@ -37,6 +43,8 @@ import sys
 import time
 import traceback
 import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -49,6 +57,7 @@ warnings.filterwarnings(
 
 import gymnasium as gym
 import numpy as np
+import psutil
 import sapien
 import sapien.wrapper.urdf_loader
 import torch
@@ -72,6 +81,8 @@ def find_render_device() -> Optional[sapien.Device]:
 
 
 RENDER_DEVICE = find_render_device()
+STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
+MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
 
 if RENDER_DEVICE is None:
     # Tasks give their objects materials even when nothing is rendered, and SAPIEN makes none without a Vulkan
@@ -88,6 +99,7 @@ if RENDER_DEVICE is None:
 
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
+from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.trajectory.merge_trajectory import merge_trajectories
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
@@ -144,8 +156,8 @@ class Args:
     """controller of the robot (None: the robot's own default)"""
     robot_uids: Optional[str] = None
     """robot (None: the task's own)"""
-    reward_mode: Optional[str] = None
-    """normalized_dense, dense or sparse (None: the first of these that the task has)"""
+    reward_mode: Optional[Literal["normalized_dense", "dense", "sparse", "none"]] = None
+    """what is learned from (None: the first of these that the task has)"""
     sim_backend: str = "auto"
     """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
     render_backend: str = "gpu"
@@ -162,10 +174,10 @@ class Args:
     """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
     eval_reconfiguration_freq: Optional[int] = None
     """rebuild evaluation scenes every so many resets; 1 suits tasks that vary their objects"""
-    render_mode: str = "rgb_array"
+    render_mode: Literal["rgb_array", "sensors", "all"] = "rgb_array"
     """what videos show: rgb_array (the scene), sensors (the task's cameras) or all"""
-    shader: str = "default"
-    """shader pack of videos: minimal or default; with CPU simulation rt-fast and rt (ray tracing) too"""
+    shader: Literal["minimal", "default", "rt-fast", "rt-med", "rt"] = "default"
+    """shader pack of videos; ray tracing (rt) works with CPU simulation only"""
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"enhanced_determinism": true}'"""
 
@@ -234,6 +246,16 @@ class Args:
     """write best.pt (the best evaluation so far) and last.pt"""
     save_freq: Optional[int] = None
     """keep a numbered checkpoint every so many iterations too"""
+    checkpoint_freq: int = 10
+    """write last.pt every so many iterations"""
+    checkpoint_minutes: float = 5
+    """write last.pt also when the one before is so old (not with --exact_resume)"""
+    resume: Optional[str] = None
+    """run folder, or checkpoint in one, to continue in place; of its flags those of the machine, of logging, evaluation
+    frequency and checkpoints, and total_timesteps may be given anew, the others are the run's own"""
+    exact_resume: bool = False
+    """start new episodes at every checkpoint_freq-th iteration and write last.pt there only: a run on CPU simulation
+    that was stopped and resumed is then bit-identical to one that was not (simulation on a GPU is not deterministic)"""
     capture_video: bool = True
     """film the first episodes of each evaluation, where there is a renderer"""
     save_train_video_freq: Optional[int] = None
@@ -265,11 +287,23 @@ CPU_DEFAULTS = dict(
     eval_freq=15,
 )  # fmt: skip
 
+# flags that a resumed run may be given anew; --evaluate takes those of the machine from the command line, not the run
+OF_THE_MACHINE = {"cuda", "sim_backend", "render_backend", "num_eval_envs", "capture_video", "save_trajectory", "track"}
+MAY_CHANGE = OF_THE_MACHINE | {
+    "total_timesteps", "stop_at_success", "eval_freq", "save_model", "save_freq", "checkpoint_freq",
+    "checkpoint_minutes", "save_train_video_freq", "render_mode", "shader", "wandb_project_name", "wandb_entity",
+    "wandb_group", "torch_deterministic", "compile", "cudagraphs", "resume",
+}  # fmt: skip
+
 
 def fail(message: str) -> NoReturn:
     """Refuse bad input: one line, exit code 2."""
-    print(f"ppo.py: {message}", file=sys.stderr)
+    print(f"ppo.py: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
+
+
+class RunError(RuntimeError):
+    """What ends a run through no fault of this script: told without a traceback of it."""
 
 
 def num_cores() -> int:
@@ -277,29 +311,56 @@ def num_cores() -> int:
 
 
 def parse_args(argv: list[str]) -> Args:
-    """Command line to Args. The defaults are those of the checkpoint to evaluate, or of the simulation backend: on a
-    GPU steps are cheap and hundreds of environments run at once, on a CPU each step is learned from more often."""
-    args = tyro.cli(Args, args=[arg for arg in argv if arg not in ("-h", "--help")])
-    args.sim_backend = resolve_backend(args)
-    default = Args()
-    if args.evaluate or args.checkpoint:
-        stored = load_checkpoint(args.checkpoint)["args"]
-        network = {k: stored[k] for k in ("norm_obs", "shared_features")}
-        machine = ("cuda", "sim_backend", "render_backend", "num_eval_envs", "num_eval_episodes", "num_eval_steps",
-                   "eval_seed", "capture_video", "save_trajectory", "track")  # fmt: skip
-    if args.evaluate:
-        default = replace(default, **{k: v for k, v in stored.items() if hasattr(default, k) and k not in machine})
-    elif args.sim_backend == "physx_cpu":
-        default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores())
+    """Command line to Args. Defaults are those of the run to resume or to evaluate, or of the simulation backend: on
+    a GPU steps are cheap and hundreds of environments run at once, on a CPU each step is learned from more often."""
+
+    def parse(argv, default):
+        errors = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(errors):
+                args = tyro.cli(Args, args=argv, default=default)
+        except SystemExit as error:
+            if error.code == 0:  # --help
+                raise
+            message = errors.getvalue().partition("\n")[2].partition("│ ──")[0]  # of a box with a title and a footer
+            fail(re.sub("[│╰╯─]+", " ", message) + " (see --help)")
+        return replace(args, sim_backend=resolve_backend(args))
+
+    args = parse([arg for arg in argv if arg not in ("-h", "--help")], Args())
+    default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
-        default.num_eval_envs = 4 * num_cores()
-    if args.checkpoint:
-        default = replace(default, **network)
-    args = tyro.cli(Args, args=argv, default=default)
-    args.sim_backend = resolve_backend(args)
+        default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores(), num_eval_envs=4 * num_cores())
+    if args.resume:
+        if args.evaluate or args.checkpoint:
+            fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
+        stored = load_checkpoint(find_checkpoint(args.resume))["args"]
+        kept = stored.keys()
+    elif args.evaluate or args.checkpoint:
+        stored = load_checkpoint(args.checkpoint)["args"]
+        of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
+        kept = stored.keys() - of_this_evaluation if args.evaluate else ("norm_obs", "shared_features")
+    default = replace(default, **{k: stored[k] for k in kept if hasattr(default, k)})
+    args = parse(argv, default)
+    if args.resume:
+        changed = [k for k in kept - MAY_CHANGE if hasattr(args, k) and getattr(args, k) != stored[k]]
+        if changed:
+            k = changed[0]
+            fail(f"--resume: the run has --{k} {stored[k]}, not {getattr(args, k)}; start a new one to change that")
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+    if args.exp_name is None:
+        args.exp_name = f"{args.env_id.split(':')[-1]}__ppo__{args.seed}__{int(time.time())}"
     return args
+
+
+def find_checkpoint(path: str) -> Path:
+    """The checkpoint that --resume means: the file itself, or the newest of a run folder."""
+    return Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
+
+
+def find_run_dir(args: Args) -> Path:
+    path = find_checkpoint(args.resume) if args.resume else args.checkpoint if args.evaluate else None
+    return Path(path).parent if path else Path("runs") / args.exp_name
 
 
 def resolve_backend(args: Args) -> str:
@@ -311,18 +372,30 @@ def resolve_backend(args: Args) -> str:
 # ----- Environments ---------------------------------------------------------------------------------------------------
 
 
+def find_task(env_id: str):
+    """The registration of a task; KeyError or ImportError if there is none."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return REGISTERED_ENVS[name]
+
+
+def default_reward_mode(task) -> str:
+    """The most telling reward that a task offers; some name "none" first."""
+    return next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in task.SUPPORTED_REWARD_MODES)
+
+
 def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
     """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
     `index` tells it from the others and only the first is filmed."""
     video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
     trajectory = evaluation and args.save_trajectory
-    modes = REGISTERED_ENVS[args.env_id.split(":")[-1]].cls.SUPPORTED_REWARD_MODES
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
         control_mode=args.control_mode,
         robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
-        reward_mode=args.reward_mode or next((m for m in ("normalized_dense", "dense", "sparse") if m in modes), None),
+        reward_mode=args.reward_mode or default_reward_mode(find_task(args.env_id).cls),
         reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
         sim_backend=args.sim_backend,
         render_backend=args.render_backend if video else "none",
@@ -363,6 +436,14 @@ def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
     if limit is None or args.num_eval_steps is None:
         return args.num_eval_episodes, limit or args.num_eval_steps or 1000
     return args.num_eval_envs * max(1, args.num_eval_steps // limit), limit
+
+
+def seed_all(*numbers: int) -> None:
+    """Seed every random generator of this process."""
+    seed = int(np.random.SeedSequence(numbers).generate_state(1)[0])
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
 
 
 def stream_seed(seed: int) -> int:
@@ -432,7 +513,8 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
     except ConnectionError:
         pass  # it did so while it was to be answered, or is gone
     except BaseException:
-        conn.send(RuntimeError(traceback.format_exc()))
+        with contextlib.suppress(ConnectionError):
+            conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
     for env in envs:
         env.close()
 
@@ -451,7 +533,7 @@ class CPUVectorEnv(gym.Env):
         description: what a progress bar calls the environments while they are built.
 
     Raises:
-        RuntimeError: with the traceback of a worker that failed.
+        RunError: with the traceback or the exit code of a worker that failed.
     """
 
     device = torch.device("cpu")
@@ -462,7 +544,8 @@ class CPUVectorEnv(gym.Env):
         context = mp.get_context("spawn")
         self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
         self.conns, self.workers = [], []
-        on_ctrl_c = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: Ctrl-C is for the main process alone
+        # inherited by the workers: to stop is for the main process alone to decide, whom it then tells
+        handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOP_SIGNALS}
         for share in self.shares:
             conn, worker_conn = context.Pipe()
             worker = context.Process(
@@ -472,14 +555,19 @@ class CPUVectorEnv(gym.Env):
             worker_conn.close()  # so that a dead worker reads as the end of its pipe
             self.conns.append(conn)
             self.workers.append(worker)
-        signal.signal(signal.SIGINT, on_ctrl_c)
-        with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
-            for i in range(len(self.shares[0])):
-                for w, share in enumerate(self.shares):
-                    if i < len(share):
-                        self._receive(w)
-                        bar.update()
-        spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+        for s, handler in handlers.items():
+            signal.signal(s, handler)
+        try:
+            with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
+                for i in range(len(self.shares[0])):
+                    for w, share in enumerate(self.shares):
+                        if i < len(share):
+                            self._receive(w)
+                            bar.update()
+            spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+        except BaseException:
+            self.close()
+            raise
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
         obs, actions = [torch.zeros(num_envs, *space.shape) for space in spaces]
@@ -501,9 +589,10 @@ class CPUVectorEnv(gym.Env):
             message = self.conns[w].recv()
         except (EOFError, ConnectionResetError):
             self.workers[w].join(5)
-            message = RuntimeError(f"died with exit code {self.workers[w].exitcode}")
-        if isinstance(message, RuntimeError):
-            raise RuntimeError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}): {message}")
+            code = self.workers[w].exitcode
+            message = RunError(f"died with exit code {code}" + " (killed; out of memory?)" * (code == -9))
+        if isinstance(message, RunError):
+            raise RunError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}) {message}")
         return message
 
     @staticmethod
@@ -549,6 +638,16 @@ class CPUVectorEnv(gym.Env):
         for worker in self.workers:
             worker.join(30)
             worker.kill()
+
+
+def workers_memory(envs: ManiSkillVectorEnv) -> float:
+    """Resident memory in MiB of the worker processes, if any; RunError where one of them has died."""
+    if not isinstance(envs.base_env, CPUVectorEnv):
+        return 0.0
+    dead = [w for w, worker in enumerate(envs.base_env.workers) if not worker.is_alive()]
+    if dead:
+        envs.base_env._receive(dead[0])
+    return sum(psutil.Process(worker.pid).memory_info().rss for worker in envs.base_env.workers) / 2**20
 
 
 def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
@@ -722,29 +821,29 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
 
 
 @torch.no_grad()
-def evaluate(agent, envs, num_episodes: int, seed: int, num_steps: int, device) -> dict[str, torch.Tensor]:
+def evaluate(
+    agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
+) -> dict[str, torch.Tensor]:
     """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
-    float tensor (num_episodes,) each, on the CPU. Leaves the random streams of training as they were."""
+    float tensor (num_episodes,) each, on the CPU."""
     low, high = action_bounds(envs, device)
     rounds = []
-    numpy_state = np.random.get_state()
-    with torch.random.fork_rng():
-        for first in range(seed, seed + num_episodes, envs.num_envs):
-            obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)))
-            running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
-            episodes = {}
-            for step in range(1, num_steps + 1):
-                action = agent.get_action(obs.to(device)).clamp(low, high)
-                obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
-                ended = running & (terminated | truncated | (step == num_steps))
-                running &= ~ended
-                at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
-                for k, v in (infos["episode"] | at_end).items():
-                    episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
-            rounds.append(episodes)
-    np.random.set_state(numpy_state)
+    seed_all(seed)
+    for first in range(seed, seed + num_episodes, envs.num_envs):
+        obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
+        running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
+        episodes = {}
+        for step in range(1, num_steps + 1):
+            action = agent.get_action(obs.to(device)).clamp(low, high).nan_to_num()
+            obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
+            ended = running & (terminated | truncated | (step == num_steps))
+            running &= ~ended
+            at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
+            for k, v in (infos["episode"] | at_end).items():
+                episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+        rounds.append(episodes)
     return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"}
 
 
@@ -763,14 +862,25 @@ def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
 # ----- Checkpoints and results ----------------------------------------------------------------------------------------
 
 
+CHECKPOINT_KEYS = {
+    "agent", "optimizer", "iteration", "global_step", "best_score", "metrics_size", "wandb_id", "args", "versions",
+}  # fmt: skip
+
+
 def save_checkpoint(path: Path, contents: dict) -> None:
-    """Write beside, then rename: at any instant the file is the old checkpoint or the new one, whole."""
-    temporary = path.with_suffix(".tmp")
-    torch.save(contents, temporary)
-    os.replace(temporary, path)
+    """Write beside, then rename: at any instant the file is the old checkpoint or the new one, whole.
+
+    Raises OSError where it cannot be written."""
+    buffer = io.BytesIO()
+    torch.save(contents, buffer)
+    with open(path.with_suffix(".tmp"), "wb") as file:
+        file.write(buffer.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(file.name, path)
 
 
-def load_checkpoint(path: Optional[str]) -> dict:
+def load_checkpoint(path: Optional[str | Path]) -> dict:
     if path is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
     try:
@@ -778,10 +888,23 @@ def load_checkpoint(path: Optional[str]) -> dict:
     except FileNotFoundError:
         fail(f"there is no checkpoint {path}")
     except Exception as error:
-        fail(f"{path} cannot be read as a checkpoint: {str(error).splitlines()[0]}")
-    if not isinstance(checkpoint, dict) or not {"agent", "args"} <= checkpoint.keys():
-        fail(f"{path} is no checkpoint of this script")
+        fail(f"{path} is not, or no longer, a readable checkpoint: {str(error).partition('. ')[0] or 'it is empty'}")
+    lacking = CHECKPOINT_KEYS - checkpoint.keys() if isinstance(checkpoint, dict) else CHECKPOINT_KEYS
+    if lacking:
+        fail(f"{path} is no checkpoint of this version of the script: it lacks {', '.join(sorted(lacking))}")
     return checkpoint
+
+
+def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path, args: Args) -> None:
+    """Give the agent the weights of a checkpoint, or refuse those of another task or network."""
+    expected, found = [{k: tuple(v.shape) for k, v in x.items()} for x in (agent.state_dict(), checkpoint["agent"])]
+    for k in {**expected, **found}:
+        if expected.get(k) != found.get(k):
+            task = checkpoint["args"]["env_id"]
+            fail(
+                f"{path}, of {task}, does not fit {args.env_id}: {k}: expected {expected.get(k)}, found {found.get(k)}"
+            )
+    agent.load_state_dict(checkpoint["agent"])
 
 
 def name_videos(folder: Path, name: str) -> list[Path]:
@@ -801,62 +924,178 @@ def merge_recorded(folder: Path) -> None:
             part.with_suffix(".json").unlink()
 
 
+def read_metrics(run_dir: Path) -> Iterator[dict]:
+    with open(run_dir / "metrics.jsonl") as file:
+        yield from (json.loads(line) for line in file if line.endswith("\n"))  # a full disk may have cut one off
+
+
+def add_scalars(writer, row: dict) -> None:
+    for key in row.keys() - {"kind", "global_step", "time"}:
+        writer.add_scalar(f"{row['kind']}/{key}", row[key], row["global_step"], walltime=row["time"])
+
+
+def open_tensorboard(run_dir: Path):
+    """A writer of TensorBoard events that begins with what metrics.jsonl holds: of a resumed run no row is missing, and
+    none is there twice."""
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the workers need none
+
+    for old in run_dir.glob("events.out.tfevents.*"):
+        old.unlink()
+    writer = SummaryWriter(str(run_dir))
+    for row in read_metrics(run_dir):
+        add_scalars(writer, row)
+    return writer
+
+
 def plot_learning_curve(run_dir: Path) -> None:
     """Draw learning_curve.png from metrics.jsonl: success, where the task knows it, and return over steps."""
     from matplotlib.figure import Figure
 
-    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
-    keys = [key for key in ("success_once", "return") if any(key in row for row in rows)]
+    points = defaultdict(list)
+    for row in read_metrics(run_dir):
+        for key in row.keys() & {"success_once", "return"}:
+            points[key, row["kind"]].append((row["global_step"], row[key]))
+    keys = sorted({key for key, _ in points}, reverse=True)
     figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
     for axis, key in zip(np.atleast_1d(figure.subplots(1, len(keys))), keys):
         for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
-            points = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind and key in row]
-            if points:
-                axis.plot(*zip(*points), label={"train": "training", "eval": "evaluation"}[kind], **style)
+            if (key, kind) in points:
+                axis.plot(*zip(*points[key, kind]), label={"train": "training", "eval": "evaluation"}[kind], **style)
         axis.set(title=key, xlabel="environment steps", ylim=(-0.03, 1.03) if key == "success_once" else None)
         axis.grid(alpha=0.3)
         axis.legend()
     figure.savefig(run_dir / "learning_curve.png", dpi=120)
+    del figure, axis
+    gc.collect()  # figures refer to themselves: megabytes that would else stay for long
 
 
 # ----- Main -----------------------------------------------------------------------------------------------------------
 
 
+AT_LEAST_ONE = (
+    "num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes", "num_eval_steps",
+    "total_timesteps", "checkpoint_freq", "save_freq", "save_train_video_freq",
+)  # fmt: skip
+POSITIVE = ("learning_rate", "clip_coef", "max_grad_norm", "reward_scale", "checkpoint_minutes")
+NOT_NEGATIVE = (
+    "seed", "critic_learning_rate", "ent_coef", "vf_coef", "target_kl", "eval_freq", "reconfiguration_freq",
+    "eval_reconfiguration_freq",
+)  # fmt: skip
+FRACTIONS = ("gamma", "gae_lambda", "stop_at_success")
+
+
 def check(args: Args) -> None:
-    """Refuse what cannot work, before anything is built or written."""
-    module, _, name = args.env_id.rpartition(":")
-    try:
-        if module:
-            importlib.import_module(module)
-    except ImportError as error:
-        fail(f"--env_id {args.env_id}: {error}")
-    if name not in REGISTERED_ENVS:
-        nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
-        fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
-    missing = [a for a in expand_data_group_into_individual_data_source_ids(name) if not is_data_source_downloaded(a)]
-    if missing:
-        fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {name}")
-    if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
-        fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
-    if args.sim_backend != "physx_cpu" and not torch.cuda.is_available():
-        fail(f"--sim_backend {args.sim_backend} needs a CUDA GPU, and torch finds none: use --sim_backend physx_cpu")
-    if args.reconfiguration_freq and args.partial_reset and args.sim_backend != "physx_cpu" and not args.evaluate:
-        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
-    for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes"):
-        if getattr(args, flag) < 1:
-            fail(f"--{flag} must be at least 1")
-    if not 0 <= args.eval_seed < 2**31 - args.num_eval_episodes - args.num_eval_envs:
-        fail("--eval_seed must be at least 0, and the seeds of all evaluation episodes below 2^31")
-    if args.track and importlib.util.find_spec("wandb") is None:
-        fail("--track needs Weights & Biases: pip install wandb")
+    """Refuse what cannot work, before anything is built or written; warn of what hardly can."""
+    for flags, good, must in (
+        (AT_LEAST_ONE, lambda x: x >= 1, "be at least 1"),
+        (POSITIVE, lambda x: 0 < x < math.inf, "be a positive number"),
+        (NOT_NEGATIVE, lambda x: 0 <= x < math.inf, "be a number that is not negative"),
+        (FRACTIONS, lambda x: 0 <= x <= 1, "lie between 0 and 1"),
+        (("logstd_init",), math.isfinite, "be a number"),
+    ):
+        for flag in flags:
+            if getattr(args, flag) is not None and not good(getattr(args, flag)):
+                fail(f"--{flag} {getattr(args, flag)}: must {must}")
     if args.batch_size < args.num_minibatches:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
         fail(f"--total_timesteps {args.total_timesteps} is less than one iteration of {args.batch_size} steps")
+    if not 0 <= args.eval_seed < 2**31 - args.num_eval_episodes - args.num_eval_envs:
+        fail("--eval_seed must be at least 0, and the seeds of all evaluation episodes below 2^31")
+
+    # --- the machine ---
+    if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
+        fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
+    if not re.fullmatch(r"(sapien_)?(cpu|((gpu|cuda)(:\d+)?))|none", args.render_backend):
+        fail(f"--render_backend {args.render_backend}: use gpu, gpu:N, cpu or none")
+    on_gpu = args.sim_backend != "physx_cpu"
+    if args.cuda and (on_gpu or Path("/proc/driver/nvidia").exists()):
+        try:
+            torch.zeros(1, device=choose_device(args) if on_gpu else "cuda")
+        except Exception as error:  # no driver, one too old for this torch, no such device
+            reason = str(error).splitlines()[0]
+            if on_gpu:
+                fail(f"--sim_backend {args.sim_backend}: {reason} To do without: --sim_backend physx_cpu")
+            print(f"the GPU is not used: {reason}")
+    if on_gpu and not args.cuda:
+        fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
+    if on_gpu:
+        try:
+            sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
+        except Exception as error:
+            remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in str(error) else "see examples/check_machine.py"
+            fail(f"--sim_backend {args.sim_backend}: PhysX cannot use the GPU ({error}): {remedy}")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        fail("--track needs Weights & Biases: pip install wandb")
+
+    # --- the task ---
+    name = args.env_id.rpartition(":")[2]
     try:
-        assert isinstance(json.loads(args.env_kwargs), dict)
-    except (ValueError, AssertionError):
+        spec = find_task(args.env_id)
+    except ImportError as error:
+        fail(f"--env_id {args.env_id}: {error}")
+    except KeyError:
+        nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
+        fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
+    defaults = {}  # of gym.make's arguments, by the task's class and those that it inherits from
+    for cls in reversed(spec.cls.__mro__[:-1]):
+        parameters = [*inspect.signature(cls.__init__).parameters.values()][1:]
+        defaults |= {p.name: p.default for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    defaults |= {"max_episode_steps": spec.max_episode_steps} | spec.default_kwargs
+    try:
+        settings = defaults | json.loads(args.env_kwargs)
+    except (ValueError, TypeError):
         fail(f"--env_kwargs must be a JSON object like '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
+    unknown = settings.keys() - defaults.keys()
+    if unknown:
+        fail(f"--env_kwargs: {name} takes no {unknown.pop()}, but {', '.join(sorted(defaults))}")
+    if args.obs_mode not in spec.cls.SUPPORTED_OBS_MODES:
+        fail(f"{name} has no observations of the state, only {', '.join(spec.cls.SUPPORTED_OBS_MODES)}")
+    if args.reward_mode not in (None, *spec.cls.SUPPORTED_REWARD_MODES):
+        fail(f"--reward_mode {args.reward_mode}: {name} has {', '.join(spec.cls.SUPPORTED_REWARD_MODES)}")
+    robots = args.robot_uids.split(",") if args.robot_uids else settings["robot_uids"]
+    assets = [name]
+    for robot in [robots] if isinstance(robots, str) else robots if isinstance(robots, (tuple, list)) else []:
+        if robot not in REGISTERED_AGENTS:
+            fail(f"--robot_uids {robot}: no such robot; {name} supports {spec.cls.SUPPORTED_ROBOTS or 'any'} of "
+                 f"{', '.join(REGISTERED_AGENTS)}")  # fmt: skip
+        agent_cls = REGISTERED_AGENTS[robot].agent_cls
+        assets += REGISTERED_AGENTS[robot].asset_download_ids
+        with contextlib.suppress(AttributeError):  # some robots know their controllers only once they are built
+            modes = agent_cls.__new__(agent_cls)._controller_configs
+            if args.control_mode not in (None, *modes):
+                fail(f"--control_mode {args.control_mode}: {robot} has {', '.join(modes)}")
+    for asset in assets:
+        if not all(map(is_data_source_downloaded, expand_data_group_into_individual_data_source_ids(asset))):
+            fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {asset}")
+    if args.reconfiguration_freq and args.partial_reset and on_gpu and not args.evaluate:
+        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
+
+    # --- the folder ---
+    run_dir = find_run_dir(args)
+    try:
+        if not (args.resume or args.evaluate):
+            metrics = run_dir / "metrics.jsonl"
+            if (run_dir / "last.pt").exists() or metrics.exists() and metrics.stat().st_size > 0:
+                fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
+        existing = next(path for path in (run_dir, *run_dir.parents) if path.exists())
+        if not (existing.is_dir() and os.access(existing, os.W_OK)):
+            fail(f"{run_dir} cannot be written: {existing} is no folder, or not yours to write")
+    except OSError as error:
+        fail(f"{run_dir} cannot be written: {error}")
+
+    # --- what may be meant otherwise ---
+    horizon = settings["max_episode_steps"]
+    if horizon and args.num_eval_steps and args.num_eval_steps < horizon:
+        print(
+            f"note: --num_eval_steps {args.num_eval_steps} ends before an episode does: whole ones of {horizon} are run"
+        )
+    if not args.evaluate:
+        if (args.reward_mode or default_reward_mode(spec.cls)) in ("sparse", "none"):
+            print(f"note: the reward of {name} is not dense: PPO may never meet a success to learn from")
+        if horizon and args.gamma < 1 and not horizon / 25 <= 1 / (1 - args.gamma) <= 10 * horizon:
+            print(f"note: --gamma {args.gamma} looks {1 / (1 - args.gamma):.0f} steps ahead, and episodes of {name} "
+                  f"have {horizon}: about {1 - 10 / max(horizon, 20):.3g} may suit it better")  # fmt: skip
 
 
 def choose_device(args: Args) -> torch.device:
@@ -895,17 +1134,17 @@ def prepare_rendering(args: Args) -> None:
         args.capture_video, args.save_train_video_freq = False, None
 
 
-def evaluate_checkpoint(args: Args) -> None:
+def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
-    checkpoint = load_checkpoint(args.checkpoint)
-    run_dir, device = Path(args.checkpoint).parent, choose_device(args)
+    run_dir, device = find_run_dir(args), choose_device(args)
     torch.set_num_threads(1)
     envs = make_envs(args, run_dir / "test_videos", evaluation=True)
+    closing.callback(envs.close)
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0], args).to(device)
-    agent.load_state_dict(checkpoint["agent"])
+    load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
     num_episodes, num_steps = evaluation_size(envs, args)
     episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
-    envs.close()
+    envs.close()  # which completes the videos
     merge_recorded(run_dir / "test_videos")
     videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
 
@@ -917,27 +1156,24 @@ def evaluate_checkpoint(args: Args) -> None:
         print(f"  {key:<16}{results[key]:8.3f}  [{low:.3f}, {high:.3f}]")
     (run_dir / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
     print(f"written: {', '.join(map(str, [run_dir / 'eval.json', *videos]))}")
+    return 0
 
 
-def train(args: Args) -> None:
-    """The training run, from the folder to the last checkpoint; the loop stands here in one piece."""
-    # --- run folder, seeds, environments, agent ---
-    run_name = args.exp_name or f"{args.env_id.split(':')[-1]}__ppo__{args.seed}__{int(time.time())}"
-    run_dir = Path("runs") / run_name
-    if (run_dir / "metrics.jsonl").exists():
-        fail(f"{run_dir} holds a run already: choose another --exp_name or remove it")
-    device = choose_device(args)
-    random.seed(args.seed)
-    np.random.seed(args.seed)
-    torch.manual_seed(args.seed)
+def train(args: Args, closing: contextlib.ExitStack) -> int:
+    """The training run, from the folder to the last checkpoint; the loop stands here in one piece.
+
+    However it ends, `closing` keeps what was learned and ends the workers. Returns the exit code."""
+    # --- environments, agent ---
+    run_dir, device = find_run_dir(args), choose_device(args)
+    resumed = load_checkpoint(find_checkpoint(args.resume)) if args.resume else {}
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
+    seed_all(args.seed)
 
     envs = make_envs(args, run_dir / "train_videos")
-    eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
+    closing.callback(envs.close)
     obs_dim, act_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     low, high = action_bounds(envs, device)
-    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, args)
 
     agent = Agent(obs_dim, act_dim, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
@@ -945,12 +1181,19 @@ def train(args: Args) -> None:
     actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
     groups = [{"params": p, "lr": lr, "peak_lr": lr} for p, lr in ((actor, args.learning_rate), (critic, critic_lr))]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
-    if args.checkpoint:
-        agent.load_state_dict(load_checkpoint(args.checkpoint)["agent"])
+    if resumed:
+        load_weights(agent, resumed, args.resume, args)
+        optimizer.load_state_dict(resumed["optimizer"])
+    elif args.checkpoint:
+        load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
+    first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
+    best_score = resumed.get("best_score", [-math.inf])
+
+    eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
+    closing.callback(eval_envs.close)
+    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, args)
 
     # --- logging ---
-    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the workers need none
-
     run_dir.mkdir(parents=True, exist_ok=True)
     packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
     about = {
@@ -960,32 +1203,63 @@ def train(args: Args) -> None:
         "command": shlex.join(sys.argv),
     }
     (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
+    wandb, wandb_id = None, resumed.get("wandb_id")
     if args.track:
         import wandb
 
-        wandb.init(project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_name,
-                   config=about, sync_tensorboard=True, save_code=True)  # fmt: skip
-    writer = SummaryWriter(str(run_dir))
-    metrics_file = open(run_dir / "metrics.jsonl", "a", buffering=1)
-    bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
-    total = args.num_iterations * args.batch_size
-    bar = tqdm(total=total, dynamic_ncols=True, disable=None, bar_format=bar_format)
+        wandb_id = wandb.init(
+            project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
+            config=about, save_code=True, id=wandb_id, resume="allow",
+        ).id  # fmt: skip
+        closing.callback(wandb.finish)
+    metrics_file = closing.enter_context(open(run_dir / "metrics.jsonl", "ab"))
+    metrics_file.truncate(min(resumed.get("metrics_size", 0), metrics_file.tell()))  # rows of steps that are redone
+    metrics_file.seek(0, os.SEEK_END)
+    writer = None
+    closing.callback(lambda: writer and writer.close())
+    bar = closing.enter_context(
+        tqdm(
+            total=args.num_iterations * args.batch_size,
+            initial=global_step,
+            dynamic_ncols=True,
+            disable=None,
+            bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}",
+        )
+    )
     bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
-    bar.write(f"writing to {run_dir}")
+    bar.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
 
     def log(kind: str, metrics: dict) -> None:
-        metrics_file.write(json.dumps({"kind": kind, "global_step": global_step, **metrics}) + "\n")
-        for key, value in metrics.items():
-            writer.add_scalar(f"{kind}/{key}", value, global_step)
+        nonlocal writer
+        finite = {k: v for k, v in metrics.items() if math.isfinite(v)}
+        row = {"kind": kind, "global_step": global_step, "time": time.time(), **finite}
+        if wandb:
+            wandb.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
+        try:
+            metrics_file.write(json.dumps(row).encode() + b"\n")
+            metrics_file.flush()
+            if writer is None:
+                writer = open_tensorboard(run_dir)
+            else:
+                add_scalars(writer, row)
+        except OSError:  # the file keeps the row for the next flush; the writer is made anew from the file
+            writer = None
+            raise
 
-    def checkpoint() -> dict:
-        rng = {"cpu": torch.get_rng_state()}
-        if device.type == "cuda":
-            rng["cuda"] = torch.cuda.get_rng_state(device)
-        return {
-            "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "rng": rng, "iteration": iteration,
-            "global_step": global_step, "best_score": best_score, "args": asdict(args), "versions": about["versions"],
-        }  # fmt: skip
+    def attempt(what: str, function, *arguments) -> None:
+        """Write something; where that fails, as on a full disk, say so and go on, unless it fails again and again."""
+        try:
+            function(*arguments)
+            failures[what] = 0
+        except OSError as error:
+            failures[what] += 1
+            bar.write(f"{what} could not be written, training goes on: {error}")
+            if failures[what] == MAX_FAILURES:
+                raise RunError(f"{what} could not be written {MAX_FAILURES} times in a row: {error}") from None
+
+    def save(name: str) -> None:
+        if args.save_model:
+            attempt(name, save_checkpoint, run_dir / name, snapshot)
 
     # --- rollout storage ---
     shape = (args.num_steps, args.num_envs)
@@ -993,131 +1267,200 @@ def train(args: Args) -> None:
     actions = torch.zeros(*shape, act_dim, device=device)
     logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
 
-    # training's seeds lie in [2^31, 2^32), evaluation's below
-    seeds = np.random.SeedSequence(args.seed).generate_state(args.num_envs) // 2 + 2**31
-    next_obs, _ = envs.reset(seed=seeds.tolist())
-    next_obs = next_obs.to(device)
-    global_step, best_score, last_line = 0, [-math.inf], time.monotonic()
+    # physics remember contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
+    rebuild = {"reconfigure": True} if args.exact_resume else None
 
-    try:
-        for iteration in range(args.num_iterations + 1):  # the number of finished updates
-            if args.save_model and args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
-                save_checkpoint(run_dir / f"iteration_{iteration}.pt", checkpoint())
+    # --- how it may end ---
+    finished, stopped_by, failures = False, 0, Counter()
+    last_line = last_saved = time.monotonic()
 
-            # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
-            last = iteration == args.num_iterations
-            if last or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0):
-                episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device)
-                metrics = {key: value.mean().item() for key, value in episodes.items()}
-                log("eval", metrics | {"num_episodes": num_eval_episodes})
-                name_videos(run_dir / "videos", f"step_{global_step:09d}")
-                score = [metrics[key] for key in ("success_once", "return") if key in metrics]
-                best = score > best_score
-                best_score = max(score, best_score)
-                bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
-                if args.save_model and best:
-                    save_checkpoint(run_dir / "best.pt", checkpoint())
-                if args.save_model:
-                    save_checkpoint(run_dir / "last.pt", checkpoint())
-                plot_learning_curve(run_dir)
-                if last or (
-                    args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
-                ):
-                    break
+    def stop(signum, frame):
+        nonlocal stopped_by
+        stopped_by = signum
+        for s in STOP_SIGNALS:
+            signal.signal(s, signal.SIG_DFL)  # a second one ends the process at once
+        os.write(
+            2, f"\n{signal.Signals(signum).name}: stopping after this iteration, or at once if repeated\n".encode()
+        )
 
-            # --- rollout: num_steps in every environment ---
-            start = time.perf_counter()
-            episode_sums, num_episodes = {}, torch.zeros((), device=device)
-            for step in range(args.num_steps):
-                obs[step] = next_obs
-                with torch.no_grad():
-                    actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
-                action = actions[step].clamp(low, high)
-                next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
-                next_obs, terminated, truncated = next_obs.to(device), terminated.to(device), truncated.to(device)
-                done = terminated | truncated
-                rewards[step] = reward.to(device) * args.reward_scale
-                dones[step] = done
-                if "final_observation" in infos:  # next_obs is the first of a new episode where done
-                    with torch.no_grad():
-                        final_value = agent.get_value(infos["final_observation"].to(device))
-                    next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
-                    num_episodes += done.sum()
-                    for key, value in infos["final_info"]["episode"].items():
-                        total = torch.where(done, value.to(device).float(), 0.0).sum()
-                        episode_sums[key] = episode_sums.get(key, 0.0) + total
-            with torch.no_grad():
-                following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
-            next_values = torch.where(dones.bool(), next_values, following)
-            advantages, returns = compute_gae(
-                rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
-            )
-            rollout_time = time.perf_counter() - start
+    for s in STOP_SIGNALS:
+        closing.callback(signal.signal, s, signal.signal(s, stop))
 
-            # --- update: update_epochs times over the batch, in shuffled minibatches ---
-            torch.set_num_threads(num_cores())
-            if args.anneal_lr:
-                for group in optimizer.param_groups:
-                    group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
-            batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
-            update_metrics = []
-            for _ in range(args.update_epochs):
-                permutation = torch.randperm(args.batch_size, device=device)
-                for i in range(args.num_minibatches):
-                    mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
-                    minibatch = [x[mb_inds] for x in batch]
-                    update_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
-                if args.target_kl is not None:  # the host waits for this number once an epoch
-                    if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
-                        break
-            if args.norm_obs:  # after the update, for which the log-probabilities of the rollout must stay valid
-                agent.update_normalization(batch[0])
-            torch.set_num_threads(1)
-            explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
+    @closing.callback
+    def save_last():
+        if finished or not args.exact_resume:  # which continues where last.pt was written anyway
+            save("last.pt")
 
-            global_step += args.batch_size
-
-            # --- log: here alone does the host wait for the device ---
-            metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
-            if episode_sums:
-                means = torch.stack([*episode_sums.values()]) / num_episodes
-                metrics = dict(zip(episode_sums, means.tolist())) | metrics
-            elapsed = time.perf_counter() - start
-            metrics |= {
-                "iteration": iteration + 1,
-                "num_episodes": int(num_episodes),
-                "explained_variance": explained_variance.item(),
-                "learning_rate": optimizer.param_groups[0]["lr"],
-                "sps": args.batch_size / elapsed,
-                "rollout_time": rollout_time,
-                "update_time": elapsed - rollout_time,
+    for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
+        # --- checkpoint: here a resumed run goes on, and hither an update that goes wrong is taken back ---
+        snapshot = copy.deepcopy(
+            {
+                "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "iteration": iteration,
+                "global_step": global_step, "best_score": best_score, "metrics_size": metrics_file.tell(),
+                "wandb_id": wandb_id, "args": about["args"], "versions": about["versions"],
             }
-            log("train", metrics)
-            bar.set_postfix_str(f"{metrics['sps']:,.0f} steps/s  {summary(metrics)}", refresh=False)
-            bar.update(args.batch_size)
-            if bar.disable and time.monotonic() - last_line > 10:  # no terminal
-                print(
-                    f"step {global_step:>9,}  training: {metrics['sps']:,.0f} steps/s, {summary(metrics)}", flush=True
-                )
-                last_line = time.monotonic()
-    finally:  # also on Ctrl-C or an error: what was learned stays
-        bar.close()
-        writer.close()
-        metrics_file.close()
-        envs.close()
-        eval_envs.close()
-        if args.save_model and global_step > 0:
-            save_checkpoint(run_dir / "last.pt", checkpoint())
+        )  # fmt: skip
+        minutes = (time.monotonic() - last_saved) / 60
+        if iteration % args.checkpoint_freq == 0 or (minutes > args.checkpoint_minutes and not args.exact_resume):
+            save("last.pt")
+            last_saved = time.monotonic()
+        if args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
+            save(f"iteration_{iteration}.pt")
+
+        # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
+        finished = iteration == args.num_iterations
+        due = finished or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0)
+        if due and not stopped_by:
+            episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
+            metrics = {key: value.mean().item() for key, value in episodes.items()}
+            attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": num_eval_episodes})
+            name_videos(run_dir / "videos", f"step_{global_step:09d}")
+            score = [metrics[key] for key in ("success_once", "return") if key in metrics]
+            best = score > best_score
+            bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
+            if best:
+                best_score = score
+                save("best.pt")
+            attempt("learning_curve.png", plot_learning_curve, run_dir)
+            if args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success:
+                finished = True
+        if finished or stopped_by:
+            break
+
+        # --- rollout: num_steps in every environment; its randomness follows from seed and iteration alone ---
+        start = time.perf_counter()
+        if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
+            seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
+            next_obs, _ = envs.reset(seed=(seeds // 2 + 2**31).tolist(), options=rebuild)  # evaluation's lie below 2^31
+            next_obs = next_obs.to(device)
+        seed_all(args.seed, iteration)
+        episode_sums, num_episodes = {}, torch.zeros((), device=device)
+        for step in range(args.num_steps):
+            obs[step] = next_obs
+            with torch.no_grad():
+                actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
+            action = actions[step].clamp(low, high).nan_to_num()  # the simulator takes no NaN; the check below does
+            next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
+            next_obs, terminated, truncated = next_obs.to(device), terminated.to(device), truncated.to(device)
+            done = terminated | truncated
+            rewards[step] = reward.to(device) * args.reward_scale
+            dones[step] = done
+            if "final_observation" in infos:  # next_obs is the first of a new episode where done
+                with torch.no_grad():
+                    final_value = agent.get_value(infos["final_observation"].to(device))
+                next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
+                num_episodes += done.sum()
+                for key, value in infos["final_info"]["episode"].items():
+                    total = torch.where(done, value.to(device).float(), 0.0).sum()
+                    episode_sums[key] = episode_sums.get(key, 0.0) + total
+        with torch.no_grad():
+            following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
+        next_values = torch.where(dones.bool(), next_values, following)
+        advantages, returns = compute_gae(
+            rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
+        )
+
+        # --- check: what is not finite must not reach the weights; the host learns of it here, once for all steps ---
+        quantities = {"observation": obs, "reward": rewards, "value": next_values}
+        broken = ~torch.stack([torch.isfinite(x).view(*shape, -1).all(-1).all(0) for x in quantities.values()])
+        problem = None
+        if broken.any():
+            names = [name for name, row in zip(quantities, broken) if row.any()]
+            env_idx = broken.any(0).nonzero().flatten()
+            problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
+            next_obs, _ = envs.reset(options={"env_idx": env_idx.to(envs.device)})
+            next_obs = next_obs.to(device)
+        rollout_time = time.perf_counter() - start
+
+        # --- update: update_epochs times over the batch, in shuffled minibatches ---
+        torch.set_num_threads(num_cores())
+        if args.anneal_lr:
+            for group in optimizer.param_groups:
+                group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
+        batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
+        update_metrics = []
+        for _ in range(0 if problem else args.update_epochs):
+            permutation = torch.randperm(args.batch_size, device=device)
+            for i in range(args.num_minibatches):
+                mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
+                minibatch = [x[mb_inds] for x in batch]
+                update_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
+            if args.target_kl is not None:  # the host waits for this number once an epoch
+                if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
+                    break
+        if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
+            agent.update_normalization(batch[0])
+        torch.set_num_threads(1)
+        explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
+        global_step += args.batch_size
+
+        # --- log: here the host waits for the device ---
+        metrics = {}
+        if update_metrics:
+            metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
+            if not all(map(math.isfinite, metrics.values())):
+                problem = "non-finite loss or gradient"
+                agent.load_state_dict(snapshot["agent"])
+                optimizer.load_state_dict(copy.deepcopy(snapshot["optimizer"]))
+        if episode_sums:
+            means = torch.stack([*episode_sums.values()]) / num_episodes
+            metrics = dict(zip(episode_sums, means.tolist())) | metrics
+        elapsed = time.perf_counter() - start
+        metrics |= {
+            "iteration": iteration + 1,
+            "num_episodes": int(num_episodes),
+            "explained_variance": explained_variance.item(),
+            "learning_rate": optimizer.param_groups[0]["lr"],
+            "update_skipped": int(problem is not None),
+            "sps": args.batch_size / elapsed,
+            "rollout_time": rollout_time,
+            "update_time": elapsed - rollout_time,
+            "memory_mb": psutil.Process().memory_info().rss / 2**20,
+            "workers_memory_mb": workers_memory(envs) + workers_memory(eval_envs),
+        }
+        if device.type == "cuda":
+            free, total = torch.cuda.mem_get_info(device)
+            metrics["gpu_memory_mb"] = (total - free) / 2**20
+        attempt("metrics.jsonl", log, "train", metrics)
+        failures["update"] = failures["update"] + 1 if problem else 0
+        if problem:
+            bar.write(f"iteration {iteration + 1}: {problem}: no update")
+            if failures["update"] == MAX_FAILURES:
+                raise RunError(f"no update in {MAX_FAILURES} iterations in a row: {problem}")
+        status = f"{metrics['sps']:,.0f} steps/s, {summary(metrics)}"
+        bar.set_postfix_str(status, refresh=False)
+        bar.update(args.batch_size)
+        if bar.disable and time.monotonic() - last_line > 10:  # no terminal
+            print(f"step {global_step:>9,}  training: {status}", flush=True)
+            last_line = time.monotonic()
+
+    if not finished:
+        return 128 + stopped_by
+    closing.close()
     merge_recorded(run_dir / "videos")
     print(f"learning curve, videos and metrics are in {run_dir}; to evaluate the best policy on other episodes:")
     print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
+    return 0
+
+
+def main(argv: list[str]) -> int:
+    args = parse_args(argv)
+    check(args)
+    prepare_rendering(args)
+    try:
+        with contextlib.ExitStack() as closing:
+            code = (evaluate_checkpoint if args.evaluate else train)(args, closing)
+    except RunError as error:
+        print(f"ppo.py: {error}", file=sys.stderr)
+        code = 1
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    last = find_run_dir(args) / "last.pt"
+    if code and last.exists() and not args.evaluate:
+        print(f"{last} is safe; to go on: python {sys.argv[0]} --resume {last.parent}", file=sys.stderr)
+    return code
 
 
 if __name__ == "__main__":
-    args = parse_args(sys.argv[1:])
-    check(args)
-    prepare_rendering(args)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
+    sys.exit(main(sys.argv[1:]))

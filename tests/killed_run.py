@@ -1,0 +1,64 @@
+"""Train on the torch-native environments, once undisturbed and once killed fifty times at random moments.
+
+Forked children spare each attempt the imports; this process itself computes nothing, so that the fork is safe."""
+
+import contextlib
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+import batched_env
+import matplotlib.figure  # noqa: F401
+import torch._dynamo  # noqa: F401
+import torch.utils.tensorboard  # noqa: F401
+
+import ppo
+
+ARGS = dict(
+    env_id="Reach", sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
+    total_timesteps=16 * 10 * 400, num_minibatches=2, eval_freq=25, capture_video=False, cuda=False, norm_obs=True,
+    anneal_lr=True, checkpoint_freq=3, exact_resume=True,
+)  # fmt: skip
+
+
+def attempt(**flags):
+    """A child that trains; its process id."""
+    pid = os.fork()
+    if pid == 0:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        ppo.make_envs = batched_env.make_envs
+        code = 1
+        with contextlib.suppress(SystemExit), contextlib.ExitStack() as closing:
+            code = ppo.train(ppo.Args(**ARGS, **flags), closing)
+        os._exit(code)
+    return pid
+
+
+def resume_or_start():
+    last = Path("runs/killed/last.pt")
+    return attempt(resume=str(last)) if last.exists() else attempt(exp_name="killed")
+
+
+if __name__ == "__main__":
+    random.seed(0)
+    assert os.waitpid(attempt(exp_name="whole"), 0)[1] == 0
+    metrics, progress = Path("runs/killed/metrics.jsonl"), []
+    for kill in range(50):
+        rows = metrics.read_bytes().count(b"\n") if metrics.exists() else 0
+        pid, goal = resume_or_start(), rows + random.randrange(12)
+        deadline = time.monotonic() + 20
+        time.sleep(random.uniform(0.0, 0.2))  # while it starts, often
+        while metrics.exists() and metrics.read_bytes().count(b"\n") < goal and time.monotonic() < deadline:
+            time.sleep(0.002)
+        time.sleep(random.uniform(0.0, 0.05))  # an iteration takes about so long
+        os.kill(pid, signal.SIGKILL)
+        assert os.waitpid(pid, 0)[1] == signal.SIGKILL, "the run ended before its fiftieth death"
+        if Path("runs/killed/last.pt").exists():
+            progress.append(ppo.load_checkpoint("runs/killed/last.pt")["iteration"])  # readable at any instant
+    assert os.waitpid(resume_or_start(), 0)[1] == 0
+    assert progress == sorted(progress) and len(set(progress)) > 20
+    print(f"50 kills, the last at iteration {progress[-1]}")

@@ -1,0 +1,523 @@
+"""Stopping, continuing and failing: on the torch-native environments in this process where that shows it, else through
+the command with real tasks."""
+
+import errno
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import batched_env
+import psutil
+import pytest
+import torch
+from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
+
+import ppo
+
+WALL_CLOCK = {"time", "sps", "rollout_time", "update_time", "memory_mb", "workers_memory_mb", "gpu_memory_mb"}
+
+
+def without_clock(rows):
+    return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]
+
+
+def scalars(folder):
+    """What TensorBoard would show: {tag: [(step, value), ...]}"""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    tags = [tag for tag in events.Tags()["scalars"] if tag.split("/")[1] not in WALL_CLOCK]
+    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
+
+
+def same_run(a, b):
+    """Weights, optimizer, metrics and TensorBoard of two run folders are equal, wall-clock fields aside."""
+    for name in ("last.pt", "best.pt"):
+        x, y = ppo.load_checkpoint(a / name), ppo.load_checkpoint(b / name)
+        assert same_weights(x, y) and x["global_step"] == y["global_step"] and x["best_score"] == y["best_score"]
+        for s, t in zip(x["optimizer"]["state"].values(), y["optimizer"]["state"].values(), strict=True):
+            assert all(torch.equal(s[k], t[k]) for k in s)
+    assert without_clock(read_metrics(a)) == without_clock(read_metrics(b))
+    assert scalars(a) == scalars(b)
+    return True
+
+
+@pytest.fixture
+def in_update(monkeypatch):
+    """Do something in the middle of the update of one iteration, once; its result, if any, stands for the metrics."""
+
+    def arrange(iteration, action, per_iteration=8):
+        update, calls = ppo.update_minibatch, []
+
+        def counting(*args):
+            calls.append(1)
+            if len(calls) == per_iteration * iteration + 3:
+                action()
+            return update(*args)
+
+        monkeypatch.setattr(ppo, "update_minibatch", counting)
+
+    return arrange
+
+
+class Stop(Exception):
+    pass
+
+
+def crash():
+    raise Stop
+
+
+def signal_self():
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+# --- resuming ---
+
+RUN = dict(
+    total_timesteps=320 * 12, eval_freq=4, update_epochs=2, target_kl=None, anneal_lr=True, norm_obs=True,
+    checkpoint_freq=3, save_freq=5,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("iteration, action", [(0, crash), (2, signal_self), (5, crash), (6, signal_self), (11, crash)])
+def test_exact_resume_is_bit_identical(train, in_update, in_tmp, iteration, action):
+    """Wherever the stop falls, in the middle of an update too: all ends as if it had not been."""
+    metrics, *_ = train(**RUN, exact_resume=True)
+    in_update(iteration, action)
+    if action is crash:
+        with pytest.raises(Stop):
+            train(**RUN, exact_resume=True)
+    else:
+        assert train(**RUN, exact_resume=True)[2] == 128 + signal.SIGTERM
+    stopped = ppo.load_checkpoint("runs/run2/last.pt")
+    finished = iteration + (action is signal_self)
+    assert stopped["iteration"] == finished // 3 * 3, "the last boundary"
+    assert train(**RUN, exact_resume=True, resume="runs/run2")[2] == 0
+    assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
+    assert len(metrics) == 12 + 4 and len(scalars("runs/run2")["train/value_loss"]) == 12
+
+
+def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
+    """From every checkpoint of a whole run the same end is reached; and its boundaries do restart the episodes."""
+    train(**RUN | dict(save_freq=3), exact_resume=True)
+    for iteration in (3, 6, 9):
+        shutil.copytree("runs/run1", f"runs/again{iteration}")
+        train(**RUN | dict(save_freq=3), exact_resume=True, resume=f"runs/again{iteration}/iteration_{iteration}.pt")
+        assert same_run(in_tmp / "runs/run1", in_tmp / f"runs/again{iteration}")
+    _, other, _ = train(**RUN)
+    assert not same_weights(other, ppo.load_checkpoint("runs/run1/last.pt")), "or the flag changes nothing"
+
+
+@pytest.mark.parametrize("action", [crash, signal_self])
+def test_resume_twice_is_the_same_twice(train, in_update, in_tmp, action):
+    """Without --exact_resume: what was finished is kept, nothing is there twice, and it is repeatable."""
+    in_update(7, action)
+    if action is crash:
+        with pytest.raises(Stop):
+            train(**RUN)
+    else:
+        assert train(**RUN)[2] == 143
+    stopped = ppo.load_checkpoint("runs/run1/last.pt")
+    assert stopped["iteration"] == (7 if action is crash else 8), "half an update is not kept, a finished one is"
+    shutil.copytree("runs/run1", "runs/again")
+    for name in ("run1", "again"):
+        metrics, last, _ = train(**RUN, resume=f"runs/{name}")
+    assert same_run(in_tmp / "runs/run1", in_tmp / "runs/again")
+    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
+    assert [row["global_step"] // 320 for row in metrics if row["kind"] == "eval"] == [0, 4, 8, 12]
+    assert last["iteration"] == 12 and last["global_step"] == 12 * 320
+
+
+def test_resume_continues_normalisation_optimizer_and_schedule(train, in_update, in_tmp):
+    in_update(8, signal_self)
+    train(**RUN)
+    at_stop = ppo.load_checkpoint("runs/run1/last.pt")
+    metrics, last, _ = train(**RUN, resume="runs/run1")
+    rates = [row["learning_rate"] for row in metrics if row["kind"] == "train"]
+    assert rates == pytest.approx([3e-4 * (1 - i / 12) for i in range(12)])
+    count = at_stop["agent"]["obs_count"]
+    assert count == pytest.approx(9 * 320, rel=1e-4)
+    assert last["agent"]["obs_count"] == pytest.approx(12 * 320, rel=1e-4)
+    assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {12 * 8}
+
+
+def test_a_finished_run_can_go_on(train, in_tmp):
+    train(total_timesteps=320 * 2)
+    metrics, last, _ = train(total_timesteps=320 * 5, resume="runs/run1")
+    assert last["iteration"] == 5 and [r["global_step"] // 320 for r in metrics if r["kind"] == "eval"] == [0, 2, 4, 5]
+
+
+def test_checkpoint_minutes(train, in_update, in_tmp):
+    """A crash that leaves no time to write costs what came since the last checkpoint: by iterations or by minutes."""
+    saved = {}
+
+    def look():
+        saved["iteration"] = ppo.load_checkpoint("runs/run1/last.pt")["iteration"]
+
+    in_update(8, look)
+    train(**RUN)
+    assert saved["iteration"] == 6
+    in_update(8, lambda: saved.update(late=ppo.load_checkpoint("runs/run2/last.pt")["iteration"]))
+    train(**RUN, checkpoint_minutes=1e-9)
+    assert saved["late"] == 8
+
+
+# --- numbers that are not finite ---
+
+
+def poison(monkeypatch, quantity, at, value=float("nan"), env_idx=(3, 7)):
+    """Let some training environments return a value that is not finite in the steps `at`."""
+    step, calls = batched_env.BatchedReach.step, []
+
+    def poisoned(self, actions):
+        obs, reward, terminated, truncated, info = step(self, actions)
+        if self.num_envs == 32:
+            calls.append(1)
+            if len(calls) in at:
+                (obs if quantity == "observation" else reward)[list(env_idx)] = value
+                if quantity == "observation":
+                    self.state[list(env_idx)] = value  # it stays, until a reset
+        return obs, reward, terminated, truncated, info
+
+    monkeypatch.setattr(batched_env.BatchedReach, "step", poisoned)
+
+
+@pytest.mark.parametrize("quantity", ["observation", "reward"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_non_finite_steps_skip_one_update(train, in_tmp, monkeypatch, capsys, quantity, value):
+    """The third iteration's update is not applied, those environments are reset, then training goes on."""
+    poison(monkeypatch, quantity, at=[25], value=value)
+    metrics, last, _ = train(**RUN | dict(save_freq=1))
+    assert [row["update_skipped"] for row in metrics if row["kind"] == "train"] == [0, 0, 1] + [0] * 9
+    output = capsys.readouterr().out
+    assert re.search(rf"^iteration 3: non-finite .*{quantity}.* in environments \[3, 7\]", output, re.M)
+    assert output.count("non-finite") == 1
+    before, after, later = [ppo.load_checkpoint(f"runs/run1/iteration_{i}.pt") for i in (2, 3, 4)]
+    assert same_weights(before, after) and not same_weights(after, later)
+    assert all(torch.isfinite(x).all() for x in last["agent"].values())
+    assert all(torch.isfinite(x).all() for s in last["optimizer"]["state"].values() for x in s.values())
+    assert last["global_step"] == 12 * 320
+
+
+def test_non_finite_gradient_is_taken_back(train, in_tmp, monkeypatch, capsys):
+    """In the middle of an update that had begun to change the weights."""
+    update, calls = ppo.update_minibatch, []
+
+    def overflowing(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values):
+        calls.append(1)
+        if len(calls) == 8 * 4 + 5:
+            returns = returns * 1e38 * 1e38
+        return update(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values)
+
+    monkeypatch.setattr(ppo, "update_minibatch", overflowing)
+    metrics, last, _ = train(**RUN | dict(save_freq=1))
+    assert [row["update_skipped"] for row in metrics if row["kind"] == "train"] == [0] * 4 + [1] + [0] * 7
+    assert "iteration 5: non-finite loss or gradient" in capsys.readouterr().out
+    before, after, later = [ppo.load_checkpoint(f"runs/run1/iteration_{i}.pt") for i in (4, 5, 6)]
+    assert same_weights(before, after) and not same_weights(after, later)
+    assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {11 * 8}
+    assert all(torch.isfinite(x).all() for x in last["agent"].values())
+
+
+def test_numbers_that_stay_non_finite_end_the_run(train, in_tmp, monkeypatch):
+    poison(monkeypatch, "reward", at=range(21, 1000), env_idx=[0])
+    with pytest.raises(ppo.RunError, match=r"no update in 5 iterations .*reward.*\[0\]"):
+        train(**RUN | dict(save_freq=1))
+    metrics, last = read_metrics(in_tmp / "runs/run1"), ppo.load_checkpoint("runs/run1/last.pt")
+    assert sum(row.get("update_skipped", 0) for row in metrics) == 5
+    assert same_weights(last, ppo.load_checkpoint("runs/run1/iteration_2.pt"))
+
+
+# --- files ---
+
+
+def test_full_disk_does_not_end_the_run_at_once(train, in_update, in_tmp, capsys):
+    """/dev/full in place of the file that is written beside: the old checkpoint stays, then a new one is written."""
+    beside = Path("runs/run1/last.tmp")
+    in_update(1, lambda: beside.symlink_to("/dev/full"))
+    in_update(7, lambda: beside.unlink())
+    seen = {}
+    in_update(6, lambda: seen.update(ppo.load_checkpoint("runs/run1/last.pt")))
+    _, last, code = train(**RUN)
+    assert code == 0 and last["iteration"] == 12 and seen["iteration"] == 0
+    output = capsys.readouterr().out
+    assert output.count("last.pt could not be written") == 2 and os.strerror(errno.ENOSPC) in output
+
+
+def test_disk_that_stays_full_ends_the_run(train, in_update, in_tmp):
+    in_update(1, lambda: Path("runs/run1/last.tmp").symlink_to("/dev/full"))
+    with pytest.raises(ppo.RunError, match="last.pt could not be written 5 times in a row"):
+        train(**RUN | dict(total_timesteps=320 * 40))
+    assert ppo.load_checkpoint("runs/run1/last.pt")["iteration"] == 0
+
+
+def test_metrics_survive_a_full_disk(train, in_update, in_tmp, capsys):
+    """Rows that could not be written are written later, in order; TensorBoard's are made anew from them."""
+    file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + 100, unlimited[1]))
+
+    in_update(3, fill)
+    in_update(6, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, unlimited))
+    try:
+        metrics, last, code = train(**RUN)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert code == 0 and last["iteration"] == 12
+    assert capsys.readouterr().out.count("metrics.jsonl could not be written") == 4
+    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
+    losses = [(row["global_step"], row["value_loss"]) for row in metrics if row["kind"] == "train"]
+    shown = scalars("runs/run1")["train/value_loss"]
+    assert [x for x, _ in shown] == [x for x, _ in losses]
+    assert [y for _, y in shown] == pytest.approx([y for _, y in losses])
+
+
+class Foreign:
+    pass
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "foreign", "code", "older", "directory", "task", "network"])
+@pytest.mark.parametrize("flag", ["--resume", "--checkpoint", "--evaluate"])
+def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, how, flag, capsys):
+    """The line names the file; and for another task, what was expected and what was found. Nothing is written."""
+    shutil.copytree(trained[0], "runs/x")
+    path, content = Path("runs/x/bad.pt"), (trained[0] / "last.pt").read_bytes()
+    checkpoint = ppo.load_checkpoint(trained[0] / "last.pt")
+    message = "bad.pt"
+    if how in ("truncated", "empty"):
+        path.write_bytes(content[: len(content) // 2 if how == "truncated" else 0])
+    elif how == "foreign":
+        torch.save({"state_dict": {}}, path)
+        message = "bad.pt.*lacks"
+    elif how == "code":
+        torch.save(checkpoint | {"agent": Foreign()}, path)
+    elif how == "older":
+        torch.save({k: v for k, v in checkpoint.items() if k != "metrics_size"}, path)
+        message = "bad.pt.*lacks metrics_size"
+    elif how == "directory":
+        path.mkdir()
+    elif how == "task":
+        checkpoint["agent"]["actor_features.0.weight"] = torch.zeros(256, 42)
+        torch.save(checkpoint, path)
+        message = r"bad.pt.*PushCube-v1.*expected \(256, 35\), found \(256, 42\)"
+    elif how == "network":
+        checkpoint["agent"]["actor_extra.weight"] = torch.zeros(3)
+        torch.save(checkpoint, path)
+        message = r"bad.pt.*actor_extra.weight: expected None, found \(3,\)"
+    before = sorted(Path("runs").rglob("*"))
+    arguments = {"--resume": ["--resume", path], "--checkpoint": ["--checkpoint", path, "--num_envs", 1],
+                 "--evaluate": ["--evaluate", "--checkpoint", path, "--num_eval_envs", 1]}[flag]  # fmt: skip
+    if flag == "--resume" and how in ("task", "network"):
+        arguments += ["--num_eval_envs", 1]
+    with pytest.raises(SystemExit) as error:
+        ppo.main([*map(str, arguments), "--no-cuda", "--no-capture_video"])
+    assert error.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(message, line)
+    assert sorted(Path("runs").rglob("*")) == before
+
+
+def test_resume_refuses_other_flags_but_those_that_may_change(trained, in_tmp, capsys):
+    shutil.copytree(trained[0], "runs/x")
+    for flags in ("--gamma 0.9", "--num_envs 8", "--env_id PickCube-v1", "--seed 3", "--no-norm_obs", "--exact_resume",
+                  "--evaluate", "--checkpoint runs/x/best.pt"):  # fmt: skip
+        with pytest.raises(SystemExit) as error:
+            ppo.parse_args(["--resume", "runs/x", *flags.split()])
+        assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
+    args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --save_freq 7 --track".split())
+    assert (args.total_timesteps, args.eval_freq, args.save_freq, args.track) == (1000, 3, 7, True)
+    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 8, 1)
+    assert ppo.find_run_dir(args) == Path("runs/x")
+
+
+# --- processes ---
+
+TINY = ("--num_envs", 4, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--num_steps", 10, "--num_minibatches", 2,
+        "--eval_freq", 0, "--no-cuda", "--no-capture_video", "--exp-name", "x", "--total_timesteps", 10**6)  # fmt: skip
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start the script in a process group of its own, wait until it trains; what it leaves behind is a defect."""
+    started = []
+
+    def run(*flags, wait_for_rows=2, **environment):
+        shared_memory = set(Path("/dev/shm").glob("*"))
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "ppo.py"), *map(str, flags)],
+            cwd=tmp_path, env={**os.environ, **NO_VULKAN, "PYTHONPATH": str(tmp_path), **environment},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+        metrics = tmp_path / "runs/x/metrics.jsonl"
+        before = len(metrics.read_text().splitlines()) if metrics.exists() else 0
+        while process.poll() is None and wait_for_rows:
+            if metrics.exists() and len(metrics.read_text().splitlines()) >= before + wait_for_rows:
+                break
+            time.sleep(0.05)
+        children = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
+        started.append((process, children, shared_memory))
+        return process, [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+
+    yield run
+    for process, children, shared_memory in started:
+        process.kill()
+        _, alive = psutil.wait_procs(children, timeout=10)
+        for child in alive:
+            child.kill()
+        assert not alive, f"left behind: {alive}"
+        assert set(Path("/dev/shm").glob("*")) <= shared_memory
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+def test_signals_finish_the_iteration(start, tmp_path, signum):
+    """Sent to all processes, as a terminal and SLURM do: exit code 128 + n, and the run continues from there."""
+    process, _ = start(*TINY)
+    os.killpg(process.pid, signum)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signum, errors
+    assert signal.Signals(signum).name in errors and "--resume runs/x" in errors and "Traceback" not in output + errors
+    rows, last = read_metrics(tmp_path / "runs/x"), ppo.load_checkpoint(tmp_path / "runs/x/last.pt")
+    assert rows[-1]["kind"] == "train" and rows[-1]["iteration"] == last["iteration"] >= 1
+    assert not list((tmp_path / "runs/x").glob("*.tmp"))
+    steps = last["global_step"] + 80
+    again = run_script("--resume", "runs/x", "--total_timesteps", steps, cwd=tmp_path, env=NO_VULKAN)
+    assert again.returncode == 0 and f"resuming runs/x at step {last['global_step']:,}" in again.stdout, again.stderr
+    rows = read_metrics(tmp_path / "runs/x")
+    assert [row["iteration"] for row in rows if row["kind"] == "train"] == [*range(1, last["iteration"] + 3)]
+
+
+def test_a_second_signal_ends_it_at_once(start):
+    process, _ = start(*TINY, "--update_epochs", 10**6, "--target_kl", "None", wait_for_rows=1)
+    time.sleep(1)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(1)
+    assert process.poll() is None, "the iteration, a long one, is still to be finished"
+    os.killpg(process.pid, signal.SIGINT)
+    process.wait(timeout=5)
+    assert process.returncode == -signal.SIGINT
+
+
+@pytest.mark.parametrize("victim", [0, -1], ids=["training", "evaluation"])
+def test_dead_worker_ends_the_run(start, tmp_path, victim):
+    process, workers = start(*TINY)
+    workers[victim].kill()
+    begun = time.monotonic()
+    output, errors = process.communicate(timeout=30)
+    assert process.returncode == 1 and time.monotonic() - begun < 10
+    assert re.search(
+        r"worker \d+ \(environments \d+ to \d+\) died with exit code -9 \(killed; out of memory\?\)", errors
+    )
+    assert "runs/x/last.pt is safe" in errors and "--resume runs/x" in errors and "Traceback" not in output + errors
+    assert (
+        ppo.load_checkpoint(tmp_path / "runs/x/last.pt")["iteration"]
+        == read_metrics(tmp_path / "runs/x")[-1]["iteration"]
+    )
+
+
+def test_dead_parent_ends_the_workers(start):
+    process, workers = start(*TINY)
+    assert len(workers) >= 2
+    process.kill()
+    begun = time.monotonic()
+    _, alive = psutil.wait_procs(workers, timeout=10)
+    assert not alive and time.monotonic() - begun < 10
+
+
+FRAGILE = """
+import os, signal
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+@register_env("Fragile-v1", max_episode_steps=50)
+class Fragile(PushCubeEnv):
+    steps = 0
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        Fragile.steps += 1
+        if Fragile.steps == 60:
+            {fault}
+        return super().compute_normalized_dense_reward(obs, action, info)
+"""
+
+
+@pytest.mark.parametrize(
+    "fault, message",
+    [
+        ("raise ValueError('my own mistake')", r"(?s)worker \d .*failed:.*fragile.py.*ValueError: my own mistake"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", r"worker \d .*died with exit code -11"),
+        ("os._exit(3)", r"worker \d .*died with exit code 3"),
+    ],
+)
+def test_faults_of_a_task(tmp_path, fault, message):
+    (tmp_path / "fragile.py").write_text(FRAGILE.format(fault=fault))
+    flags = (*TINY, "--env_id", "fragile:Fragile-v1")
+    process = run_script(*flags, cwd=tmp_path, env={**NO_VULKAN, "PYTHONPATH": str(tmp_path)}, timeout=120)
+    assert process.returncode == 1 and re.search(message, process.stderr), process.stderr
+    assert "last.pt is safe" in process.stderr and process.stderr.count("Traceback") == ("raise" in fault)
+
+
+def test_physics_that_explode_are_survived(tmp_path):
+    """A cube at nowhere in one environment of the real simulator: one update is skipped, then training goes on."""
+    fault = "self.cube if 0 else self.obj.set_pose(Pose.create_from_pq(torch.full((1, 3), float('nan'))))"
+    source = "import torch\nfrom mani_skill.utils.structs import Pose\n" + FRAGILE.format(fault=fault)
+    (tmp_path / "fragile.py").write_text(source)
+    flags = (*TINY, "--env_id", "fragile:Fragile-v1", "--num_steps", 30, "--total_timesteps", 720)
+    process = run_script(*flags, cwd=tmp_path, env={**NO_VULKAN, "PYTHONPATH": str(tmp_path)}, timeout=120)
+    assert process.returncode == 0, process.stderr
+    skipped = [row["update_skipped"] for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "train"]
+    assert len(skipped) == 6 and sum(skipped) == 1, process.stdout
+
+
+@pytest.mark.slow
+def test_exact_resume_with_real_tasks(start, tmp_path):
+    """The pool, and one environment in the process: stopped by kill -9 or a signal, the same as never stopped."""
+    for num_envs, signum in ((4, signal.SIGKILL), (1, signal.SIGKILL), (4, signal.SIGTERM)):
+        flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_steps", 20,
+                 "--total_timesteps", 20 * 20 * num_envs, "--eval_freq", 7]  # fmt: skip
+        whole = run_script(*flags, "--exp-name", "whole", cwd=tmp_path, env=NO_VULKAN)
+        assert whole.returncode == 0, whole.stderr
+        process, _ = start(*flags, wait_for_rows=8)
+        process.send_signal(signum)
+        process.communicate(timeout=60)
+        assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "it was stopped before its end"
+        again = run_script("--resume", "runs/x", cwd=tmp_path, env=NO_VULKAN)
+        assert again.returncode == 0, again.stderr
+        assert same_run(tmp_path / "runs/whole", tmp_path / "runs/x")
+        shutil.rmtree(tmp_path / "runs")
+
+
+@pytest.mark.slow
+def test_kill_at_random_moments(tmp_path):
+    """kill -9 fifty times: at any instant there is a readable checkpoint or none yet; in the end the run is whole and
+    equal to one that was never killed."""
+    process = subprocess.run(
+        [sys.executable, str(Path(__file__).parent / "killed_run.py")], cwd=tmp_path, capture_output=True, text=True,
+        timeout=600,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stderr
+    assert "50 kills" in process.stdout
+    assert same_run(tmp_path / "runs/whole", tmp_path / "runs/killed")
+
+
+@pytest.mark.slow
+def test_memory_is_flat(tmp_path):
+    """Over 2,000 iterations, of the main process and of the workers."""
+    flags = ("--num_envs", 2, "--num_eval_envs", 1, "--num_eval_episodes", 1, "--num_steps", 5, "--num_minibatches", 1,
+             "--update_epochs", 1, "--eval_freq", 100, "--no-capture_video", "--no-cuda", "--exp-name", "x",
+             "--total_timesteps", 20_000)  # fmt: skip
+    process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
+    assert process.returncode == 0, process.stderr
+    rows = [row for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "train"]
+    assert len(rows) == 2000
+    for key in ("memory_mb", "workers_memory_mb"):
+        early, late = [sum(row[key] for row in part) / len(part) for part in (rows[500:600], rows[-100:])]
+        assert late - early < 3, (key, early, late)
