@@ -330,22 +330,21 @@ def parse_args(argv: list[str]) -> Args:
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
         default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores(), num_eval_envs=4 * num_cores())
-    if args.resume:
+    if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
         stored = load_checkpoint(find_checkpoint(args.resume))["args"]
         kept = stored.keys()
-    elif args.evaluate or args.checkpoint:
+    elif args.evaluate or args.checkpoint is not None:
         stored = load_checkpoint(args.checkpoint)["args"]
         of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
         kept = stored.keys() - of_this_evaluation if args.evaluate else ("norm_obs", "shared_features")
-    default = replace(default, **{k: stored[k] for k in kept if hasattr(default, k)})
-    args = parse(argv, default)
-    if args.resume:
-        changed = [k for k in kept - MAY_CHANGE if hasattr(args, k) and getattr(args, k) != stored[k]]
-        if changed:
-            k = changed[0]
-            fail(f"--resume: the run has --{k} {stored[k]}, not {getattr(args, k)}; start a new one to change that")
+    args = parse(argv, replace(default, **{k: stored[k] for k in kept if hasattr(default, k)}))
+    if args.resume is not None:
+        for k in kept - MAY_CHANGE:
+            if hasattr(args, k) and getattr(args, k) != stored[k]:
+                fail(f"--resume: the run has --{k} {stored[k]}, not {getattr(args, k)}; start a new one to change that")
+        args.resume = str(find_checkpoint(args.resume))
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
     if args.exp_name is None:
@@ -359,8 +358,8 @@ def find_checkpoint(path: str) -> Path:
 
 
 def find_run_dir(args: Args) -> Path:
-    path = find_checkpoint(args.resume) if args.resume else args.checkpoint if args.evaluate else None
-    return Path(path).parent if path else Path("runs") / args.exp_name
+    checkpoint = args.resume or (args.checkpoint if args.evaluate else None)
+    return Path(checkpoint).parent if checkpoint else Path("runs") / args.exp_name
 
 
 def resolve_backend(args: Args) -> str:
@@ -901,9 +900,7 @@ def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path, args: Arg
     for k in {**expected, **found}:
         if expected.get(k) != found.get(k):
             task = checkpoint["args"]["env_id"]
-            fail(
-                f"{path}, of {task}, does not fit {args.env_id}: {k}: expected {expected.get(k)}, found {found.get(k)}"
-            )
+            fail(f"{path} ({task}) does not fit {args.env_id}: {k}: expected {expected.get(k)}, found {found.get(k)}")
     agent.load_state_dict(checkpoint["agent"])
 
 
@@ -1055,10 +1052,12 @@ def check(args: Args) -> None:
         fail(f"--reward_mode {args.reward_mode}: {name} has {', '.join(spec.cls.SUPPORTED_REWARD_MODES)}")
     robots = args.robot_uids.split(",") if args.robot_uids else settings["robot_uids"]
     assets = [name]
-    for robot in [robots] if isinstance(robots, str) else robots if isinstance(robots, (tuple, list)) else []:
+    robots = robots if isinstance(robots, (tuple, list)) else [robots]
+    for robot in [robot for robot in robots if isinstance(robot, str) and robot != "none"]:  # others bring a class
         if robot not in REGISTERED_AGENTS:
-            fail(f"--robot_uids {robot}: no such robot; {name} supports {spec.cls.SUPPORTED_ROBOTS or 'any'} of "
-                 f"{', '.join(REGISTERED_AGENTS)}")  # fmt: skip
+            fail(
+                f"--robot_uids {robot}: no such robot, but {', '.join(spec.cls.SUPPORTED_ROBOTS or REGISTERED_AGENTS)}"
+            )
         agent_cls = REGISTERED_AGENTS[robot].agent_cls
         assets += REGISTERED_AGENTS[robot].asset_download_ids
         with contextlib.suppress(AttributeError):  # some robots know their controllers only once they are built
@@ -1078,7 +1077,8 @@ def check(args: Args) -> None:
             metrics = run_dir / "metrics.jsonl"
             if (run_dir / "last.pt").exists() or metrics.exists() and metrics.stat().st_size > 0:
                 fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
-        existing = next(path for path in (run_dir, *run_dir.parents) if path.exists())
+        absolute = Path(os.path.abspath(run_dir))
+        existing = next(path for path in (absolute, *absolute.parents) if path.exists())
         if not (existing.is_dir() and os.access(existing, os.W_OK)):
             fail(f"{run_dir} cannot be written: {existing} is no folder, or not yours to write")
     except OSError as error:
@@ -1087,9 +1087,7 @@ def check(args: Args) -> None:
     # --- what may be meant otherwise ---
     horizon = settings["max_episode_steps"]
     if horizon and args.num_eval_steps and args.num_eval_steps < horizon:
-        print(
-            f"note: --num_eval_steps {args.num_eval_steps} ends before an episode does: whole ones of {horizon} are run"
-        )
+        print(f"note: --num_eval_steps {args.num_eval_steps} ends before an episode does: all {horizon} steps are run")
     if not args.evaluate:
         if (args.reward_mode or default_reward_mode(spec.cls)) in ("sparse", "none"):
             print(f"note: the reward of {name} is not dense: PPO may never meet a success to learn from")
@@ -1165,7 +1163,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     However it ends, `closing` keeps what was learned and ends the workers. Returns the exit code."""
     # --- environments, agent ---
     run_dir, device = find_run_dir(args), choose_device(args)
-    resumed = load_checkpoint(find_checkpoint(args.resume)) if args.resume else {}
+    resumed = load_checkpoint(args.resume) if args.resume else {}
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
@@ -1217,15 +1215,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     metrics_file.seek(0, os.SEEK_END)
     writer = None
     closing.callback(lambda: writer and writer.close())
-    bar = closing.enter_context(
-        tqdm(
-            total=args.num_iterations * args.batch_size,
-            initial=global_step,
-            dynamic_ncols=True,
-            disable=None,
-            bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}",
-        )
-    )
+    bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+    total = args.num_iterations * args.batch_size
+    bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=None, bar_format=bar_format)
+    closing.callback(bar.close)
     bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
     bar.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
 

@@ -47,7 +47,7 @@ if __name__ == "__main__":
     random.seed(0)
     assert os.waitpid(attempt(exp_name="whole"), 0)[1] == 0
     metrics, progress = Path("runs/killed/metrics.jsonl"), []
-    for kill in range(50):
+    for _ in range(50):
         rows = metrics.read_bytes().count(b"\n") if metrics.exists() else 0
         pid, goal = resume_or_start(), rows + random.randrange(12)
         deadline = time.monotonic() + 20

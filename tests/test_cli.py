@@ -109,41 +109,6 @@ def test_wilson_interval():
     assert ppo.interval(values, rate=False) == pytest.approx((4.5 - half, 4.5 + half))
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (("--env_id", "PushCub-v1"), "PushCube-v1"),
-        (("--env_id", "no.such.module:Task-v1"), "no"),
-        (("--num_envs", 0), "num_envs"),
-        (("--num_envs", 2, "--num_steps", 3, "--num_minibatches", 7), "num_minibatches"),
-        (("--total_timesteps", 10, "--num_envs", 4, "--num_steps", 4), "total_timesteps"),
-        (("--sim_backend", "physx_quantum"), "sim_backend"),
-        (("--env_kwargs", "[1]"), "env_kwargs"),
-        (("--evaluate",), "--checkpoint"),
-        (("--evaluate", "--checkpoint", "nowhere.pt"), "nowhere.pt"),
-        (("--evaluate", "--checkpoint", "garbage.pt"), "garbage.pt"),
-        (("--exp-name", "there"), "there"),
-        pytest.param(
-            ("--sim_backend", "physx_cuda"),
-            "CUDA",
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has one"),
-        ),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(arguments, message, in_tmp, capsys):
-    (in_tmp / "garbage.pt").write_bytes(b"not a checkpoint")
-    (in_tmp / "runs/there").mkdir(parents=True)
-    (in_tmp / "runs/there/metrics.jsonl").touch()
-    before = sorted(in_tmp.rglob("*"))
-    with pytest.raises(SystemExit) as exit:
-        args = ppo.parse_args(["--no-cuda", "--no-capture_video", *map(str, arguments)])
-        ppo.check(args)
-        ppo.train(args)
-    error = capsys.readouterr().err
-    assert exit.value.code == 2 and error.count("\n") == 1 and message in error
-    assert sorted(in_tmp.rglob("*")) == before
-
-
 def test_refusal_as_a_command(tmp_path):
     process = run_script("--env_id", "PickCub-v1", cwd=tmp_path)
     assert process.returncode == 2 and "PickCube-v1" in process.stderr and process.stderr.count("\n") == 1

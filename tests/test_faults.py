@@ -322,7 +322,7 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, how, flag, c
         ppo.main([*map(str, arguments), "--no-cuda", "--no-capture_video"])
     assert error.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert re.search(message, line)
+    assert re.search(message, line), line
     assert sorted(Path("runs").rglob("*")) == before
 
 

@@ -1,0 +1,190 @@
+"""Bad input is refused before anything is built: exit code 2, one line, nothing written. Good input runs."""
+
+import random
+from functools import partial
+from pathlib import Path
+
+import batched_env
+import pytest
+import torch
+
+import ppo
+
+
+def refused(arguments, capsys):
+    """The one line with which the script refuses these arguments; fails unless it refuses them as it should."""
+    before = sorted(Path().rglob("*"))
+    with pytest.raises(SystemExit) as exit:
+        ppo.main([*map(str, arguments)])
+    output = capsys.readouterr()
+    assert exit.value.code == 2, arguments
+    assert output.err.count("\n") == 1 and output.err.startswith("ppo.py: ") and "Traceback" not in output.err
+    assert sorted(Path().rglob("*")) == before, "nothing is written"
+    return output.err
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ("--env_id PushCub-v1", "PushCube-v1"),
+        ("--env_id no.such.module:Task-v1", "no"),
+        ("--env_id PutCarrotOnPlateInScene-v1", "rgb+segmentation"),
+        ("--env_id PickSingleYCB-v1", "python -m mani_skill.utils.download_asset PickSingleYCB-v1"),
+        ("--env_id AnymalC-Reach-v1", "python -m mani_skill.utils.download_asset anymal_c"),
+        ("--control_mode pd_thoughts", "pd_joint_delta_pos, pd_joint_pos"),
+        ("--robot_uids pandaa", "panda"),
+        ("--reward_mode sparse --env_id MS-AntRun-v1", "normalized_dense, dense, none"),
+        ("--obs_mode rgb", "state"),
+        ("--num_envs 0", "num_envs"),
+        ("--num_steps -1", "num_steps"),
+        ("--learning_rate nan", "learning_rate"),
+        ("--learning_rate 0", "learning_rate"),
+        ("--gamma 1.01", "gamma"),
+        ("--max_grad_norm inf", "max_grad_norm"),
+        ("--target_kl nan", "target_kl"),
+        ("--stop_at_success 95", "stop_at_success"),
+        ("--num_envs 2 --num_steps 3 --num_minibatches 7", "num_minibatches"),
+        ("--total_timesteps 10 --num_envs 4 --num_steps 4", "total_timesteps"),
+        ("--sim_backend physx_quantum", "sim_backend"),
+        ("--render_backend paper", "render_backend"),
+        ("--env_kwargs [1]", "env_kwargs"),
+        ("--env_kwargs {", "env_kwargs"),
+        ('--env_kwargs {"colour":1}', "takes no colour, but"),
+        ("--evaluate", "--checkpoint"),
+        ("--evaluate --checkpoint nowhere.pt", "nowhere.pt"),
+        ("--evaluate --checkpoint garbage.pt", "garbage.pt"),
+        ("--resume nowhere", "nowhere"),
+        ("--resume runs", "runs/last.pt"),
+        ("--exp-name there", "--resume runs/there"),
+        ("--exp-name ../garbage.pt/x", "garbage.pt"),
+        ("--exp-name " + 300 * "x", "cannot be written"),
+        ("--eval_seed 2147483647", "eval_seed"),
+        ("--gama 0.9", "--gama"),
+        ("--num_envs", "num-envs"),
+        ("--num_envs many", "many"),
+        pytest.param("--sim_backend physx_cuda --cuda", "CUDA|NVIDIA",
+                     marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has one")),
+    ],
+)  # fmt: skip
+def test_bad_input(arguments, message, in_tmp, capsys):
+    (in_tmp / "garbage.pt").write_bytes(b"not a checkpoint")
+    (in_tmp / "runs/there").mkdir(parents=True)
+    (in_tmp / "runs/there/metrics.jsonl").write_text("{}\n")
+    line = refused(["--no-cuda", "--no-capture_video", *arguments.split()], capsys)
+    assert any(part in line for part in message.split("|")), line
+
+
+def test_physx_without_its_library_is_refused(in_tmp, capsys, monkeypatch):
+    """As SAPIEN fails where the download, or the unversioned libcuda.so, is missing."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch, "zeros", lambda *args, **kwargs: None)
+    for error, remedy in (
+        (OSError("libcuda.so: cannot open shared object file: No such file or directory"), "libcuda.so.1"),
+        (ConnectionError("HTTPSConnectionPool: Max retries exceeded"), "check_machine.py"),
+    ):
+
+        def enable_gpu(error=error):
+            raise error
+
+        monkeypatch.setattr(ppo.sapien.physx, "enable_gpu", enable_gpu)
+        assert remedy in refused(["--sim_backend", "physx_cuda", "--no-capture_video"], capsys)
+
+
+def test_driver_too_old_is_told(in_tmp, capsys, monkeypatch):
+    """With physx_cuda a refusal; else the run goes on without the GPU and says why."""
+
+    def zeros(*args, device=None, **kwargs):
+        raise RuntimeError("The NVIDIA driver on your system is too old (found version 11000).\nPlease update.")
+
+    monkeypatch.setattr(torch, "zeros", zeros)
+    assert "driver on your system is too old" in refused(["--sim_backend", "physx_cuda"], capsys)
+
+
+@pytest.mark.parametrize(
+    "arguments, note",
+    [
+        ("--env_id MS-CartpoleSwingUp-v1", "--gamma 0.8 looks 5 steps ahead, and episodes of MS-CartpoleSwingUp-v1"),
+        ("--env_id PlugCharger-v1 --gamma 0.97", "not dense"),
+        ("--reward_mode sparse", "not dense"),
+        ("--num_eval_steps 20", "--num_eval_steps 20 ends before an episode does"),
+        ("", None),
+        ("--gamma 0.99 --env_id MS-CartpoleSwingUp-v1", None),
+    ],
+)  # fmt: skip
+def test_notes(arguments, note, in_tmp, capsys):
+    args = ppo.parse_args(["--no-cuda", *arguments.split()])
+    ppo.check(args)
+    output = capsys.readouterr().out
+    assert output.count("note:") == (note is not None) and (note or "") in output
+
+
+VALID = {
+    "num_envs": [1, 2, 7], "num_eval_envs": [1, 3], "num_eval_episodes": [1, 4], "num_steps": [4, 9],
+    "num_minibatches": [1, 3, 4], "update_epochs": [1, 2], "learning_rate": [1e-9, 0.1, 3], "seed": [0, 2**40],
+    "critic_learning_rate": [0, 1e-3, None], "gamma": [0, 0.97, 1], "gae_lambda": [0, 0.5, 1], "clip_coef": [0.01, 5],
+    "ent_coef": [0, 0.1], "vf_coef": [0, 2], "max_grad_norm": [1e-3, 100], "target_kl": [None, 0, 0.02],
+    "reward_scale": [1e-3, 10], "bootstrap_at_done": ["always", "truncated", "never"], "logstd_init": [-3, 0.5],
+    "eval_freq": [0, 1, 2], "num_eval_steps": [None, 1, 100], "eval_seed": [0, 2**30], "stop_at_success": [None, 0, 1],
+    "save_freq": [None, 1], "checkpoint_freq": [1, 3], "checkpoint_minutes": [1e-6, 100], "exp_name": ["x", "a/b c"],
+    "reward_mode": [None, "sparse", "dense"], "control_mode": [None, "pd_ee_delta_pose"], "robot_uids": [None, "panda"],
+    "env_kwargs": ["{}", '{"max_episode_steps": 30}'], "render_backend": ["none", "cpu", "gpu:0"],
+    "sim_backend": ["cpu", "physx_cpu"], "reconfiguration_freq": [None, 0, 1], "render_mode": ["all", "sensors"],
+    "shader": ["minimal"], "wandb_entity": [None, "us"], "total_timesteps": [126, 500],
+}  # fmt: skip
+SWITCHES = [
+    "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "shared_features", "norm_obs", "save_model",
+    "exact_resume", "partial_reset", "eval_partial_reset", "torch_deterministic", "compile", "cudagraphs",
+]  # fmt: skip
+NUMBERS = ["0", "-1", "1.5.", "nan", "inf", "x", ""]
+INVALID = {
+    **{flag: NUMBERS for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs",
+                                  "num_eval_episodes", "learning_rate", "clip_coef", "max_grad_norm", "checkpoint_freq",
+                                  "checkpoint_minutes", "reward_scale")},
+    **{flag: NUMBERS[1:] for flag in ("seed", "eval_freq", "ent_coef", "vf_coef", "target_kl", "eval_seed")},
+    **{flag: [*NUMBERS[1:], "1.1"] for flag in ("gamma", "gae_lambda", "stop_at_success")},
+    "logstd_init": ["nan", "inf", "?"], "total_timesteps": ["0", "3", "-5", "1e5x"],
+    "env_kwargs": ["", "{", "[]", '{"a": 1}'],
+    "env_id": ["", "PushCube", "pushcube-v1", ":", "a:b:c", "os:PushCube-v9"], "control_mode": ["", "pd"],
+    "robot_uids": ["r2d2", "panda,r2d2"], "obs_mode": ["rgb", ""], "reward_mode": ["best"],
+    "sim_backend": ["", "gazebo"], "bootstrap_at_done": ["sometimes"], "render_backend": ["gpu:", "vulkan"],
+    "render_mode": ["human"], "shader": ["x"],
+    "resume": ["", "nowhere", "."], "checkpoint": ["nowhere", "."], "nonsense": ["1"], "partial_reset": ["maybe"],
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_fuzz(in_tmp, capsys, monkeypatch):
+    """300 generated command lines: the valid ones run (tiny), those with one invalid value anywhere are refused."""
+    rng = random.Random(0)
+    monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
+    monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)  # slow
+
+    def spell(flag, value):
+        flag = "--" + rng.choice([flag, flag.replace("_", "-")])
+        return [f"{flag}={value}"] if rng.random() < 0.5 else [flag, str(value)]
+
+    counts = [0, 0]
+    for k in range(300):
+        base = dict(num_envs=7, num_eval_envs=2, num_eval_episodes=2, num_steps=9, total_timesteps=126,
+                    num_minibatches=4, update_epochs=1, exp_name=f"run{k}")  # fmt: skip
+        chosen = base | {flag: rng.choice(VALID[flag]) for flag in rng.sample([*VALID], rng.randrange(12))}
+        if chosen["num_envs"] * chosen["num_steps"] < chosen["num_minibatches"]:
+            chosen["num_minibatches"] = 1
+        chosen["exp_name"] = f"run{k}/{chosen['exp_name']}"
+        switches = ["--" + rng.choice(["", "no-"]) + flag for flag in rng.sample(SWITCHES, rng.randrange(5))]
+        invalid = rng.random() < 0.5
+        if invalid:
+            flag = rng.choice([*INVALID])
+            chosen[flag] = rng.choice(INVALID[flag])
+        parts = [spell(flag, value) for flag, value in chosen.items()] + [[switch] for switch in switches]
+        rng.shuffle(parts)
+        arguments = ["--no-cuda", "--no-capture-video", *sum(parts, [])]
+        print(arguments)
+        if invalid:
+            refused(arguments, capsys)
+        else:
+            assert ppo.main(arguments) == 0, (arguments, capsys.readouterr())
+            assert (Path("runs") / chosen["exp_name"] / "metrics.jsonl").exists()
+        counts[invalid] += 1
+        capsys.readouterr()
+    assert min(counts) > 100
