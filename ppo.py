@@ -1309,7 +1309,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": num_eval_episodes})
             name_videos(run_dir / "videos", f"step_{global_step:09d}")
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
-            best = score > best_score
+            best = score > best_score and all(map(math.isfinite, score))
             bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
             if best:
                 best_score = score

@@ -3,7 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import torch
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+from ppo import ManiSkillVectorEnv  # ppo before mani_skill, which it prepares for machines without Vulkan
 
 
 class BatchedReach(gym.Env):

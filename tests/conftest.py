@@ -71,7 +71,9 @@ def train(in_tmp, monkeypatch, device):
 
     def run(**flags):
         nonlocal count
-        count += not flags.get("resume")
+        count += "resume" not in flags
+        if "resume" in flags:
+            flags["resume"] = str(ppo.find_checkpoint(flags["resume"]))
         args = replace(SMALL, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
         with contextlib.ExitStack() as closing:
             code = ppo.train(args, closing)
