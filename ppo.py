@@ -251,11 +251,11 @@ class Args:
     checkpoint_minutes: float = 5
     """write last.pt also when the one before is so old (not with --exact_resume)"""
     resume: Optional[str] = None
-    """run folder, or checkpoint in one, to continue in place; of its flags those of the machine, of logging, evaluation
-    frequency and checkpoints, and total_timesteps may be given anew, the others are the run's own"""
+    """run folder, or checkpoint in one, to continue in place, with the run's own flags; those of the machine, logging,
+    videos and checkpoints, eval_freq, stop_at_success and total_timesteps may be given anew"""
     exact_resume: bool = False
-    """start new episodes at every checkpoint_freq-th iteration and write last.pt there only: a run on CPU simulation
-    that was stopped and resumed is then bit-identical to one that was not (simulation on a GPU is not deterministic)"""
+    """start new episodes in new scenes at every checkpoint_freq-th iteration and write last.pt there only: a run on CPU
+    simulation that was stopped and resumed is then bit-identical to one that was not (a GPU's is not deterministic)"""
     capture_video: bool = True
     """film the first episodes of each evaluation, where there is a renderer"""
     save_train_video_freq: Optional[int] = None
@@ -353,7 +353,7 @@ def parse_args(argv: list[str]) -> Args:
 
 
 def find_checkpoint(path: str) -> Path:
-    """The checkpoint that --resume means: the file itself, or the newest of a run folder."""
+    """The checkpoint that --resume means: the file itself, or a run folder's last.pt."""
     return Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
 
 
@@ -419,6 +419,7 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
             save_video=video,
             save_video_trigger=is_filmed,
             save_on_reset=evaluation,
+            avoid_overwriting_video=not evaluation,
             max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
             video_fps=base_env.control_freq,
             save_trajectory=trajectory,
@@ -469,7 +470,7 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
 
     def batch(infos):
         return {
-            k: torch.cat([info[k] for info in infos]).numpy() if isinstance(v, torch.Tensor) else v
+            k: torch.cat([torch.atleast_1d(info[k]) for info in infos]).numpy() if isinstance(v, torch.Tensor) else v
             for k, v in (infos[0].items() if infos else ())
         }
 
@@ -479,6 +480,8 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
             seed = None if seeds is None else seeds[i]
             if seed is not None:
                 streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
+                np.random.seed(seed)
+                random.seed(seed)
             reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
             infos.append(info)
         return batch(infos)
@@ -823,13 +826,14 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
 def evaluate(
     agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
 ) -> dict[str, torch.Tensor]:
-    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
+    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k (on a
+    GPU ManiSkill draws those of a batch from its first seed).
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
     float tensor (num_episodes,) each, on the CPU."""
     low, high = action_bounds(envs, device)
     rounds = []
-    seed_all(seed)
+    seed_all(seed)  # for tasks that draw during an episode
     for first in range(seed, seed + num_episodes, envs.num_envs):
         obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
@@ -953,6 +957,8 @@ def plot_learning_curve(run_dir: Path) -> None:
         for key in row.keys() & {"success_once", "return"}:
             points[key, row["kind"]].append((row["global_step"], row[key]))
     keys = sorted({key for key, _ in points}, reverse=True)
+    if not keys:
+        return
     figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
     for axis, key in zip(np.atleast_1d(figure.subplots(1, len(keys))), keys):
         for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
@@ -969,30 +975,23 @@ def plot_learning_curve(run_dir: Path) -> None:
 # ----- Main -----------------------------------------------------------------------------------------------------------
 
 
-AT_LEAST_ONE = (
-    "num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs", "num_eval_episodes", "num_eval_steps",
-    "total_timesteps", "checkpoint_freq", "save_freq", "save_train_video_freq",
+LIMITS = (  # of numbers that are given; none may be infinite or not a number
+    (1, 1e18, "num_envs num_eval_envs num_steps num_minibatches update_epochs num_eval_episodes num_eval_steps "
+              "total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+    (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (0, 1e18, "seed critic_learning_rate ent_coef vf_coef target_kl eval_freq eval_seed reconfiguration_freq "
+              "eval_reconfiguration_freq"),
+    (0, 1, "gamma gae_lambda stop_at_success"),
+    (-20, 5, "logstd_init"),
 )  # fmt: skip
-POSITIVE = ("learning_rate", "clip_coef", "max_grad_norm", "reward_scale", "checkpoint_minutes")
-NOT_NEGATIVE = (
-    "seed", "critic_learning_rate", "ent_coef", "vf_coef", "target_kl", "eval_freq", "reconfiguration_freq",
-    "eval_reconfiguration_freq",
-)  # fmt: skip
-FRACTIONS = ("gamma", "gae_lambda", "stop_at_success")
 
 
 def check(args: Args) -> None:
     """Refuse what cannot work, before anything is built or written; warn of what hardly can."""
-    for flags, good, must in (
-        (AT_LEAST_ONE, lambda x: x >= 1, "be at least 1"),
-        (POSITIVE, lambda x: 0 < x < math.inf, "be a positive number"),
-        (NOT_NEGATIVE, lambda x: 0 <= x < math.inf, "be a number that is not negative"),
-        (FRACTIONS, lambda x: 0 <= x <= 1, "lie between 0 and 1"),
-        (("logstd_init",), math.isfinite, "be a number"),
-    ):
-        for flag in flags:
-            if getattr(args, flag) is not None and not good(getattr(args, flag)):
-                fail(f"--{flag} {getattr(args, flag)}: must {must}")
+    for low, high, flags in LIMITS:
+        for flag in flags.split():
+            if getattr(args, flag) is not None and not low <= getattr(args, flag) <= high:
+                fail(f"--{flag} {getattr(args, flag)}: must lie between {low:g} and {high:g}")
     if args.batch_size < args.num_minibatches:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
@@ -1003,25 +1002,28 @@ def check(args: Args) -> None:
     # --- the machine ---
     if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
         fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
-    if not re.fullmatch(r"(sapien_)?(cpu|((gpu|cuda)(:\d+)?))|none", args.render_backend):
-        fail(f"--render_backend {args.render_backend}: use gpu, gpu:N, cpu or none")
     on_gpu = args.sim_backend != "physx_cpu"
-    if args.cuda and (on_gpu or Path("/proc/driver/nvidia").exists()):
+    if on_gpu and not args.cuda:
+        fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
+    if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
         try:
             torch.zeros(1, device=choose_device(args) if on_gpu else "cuda")
         except Exception as error:  # no driver, one too old for this torch, no such device
             reason = str(error).splitlines()[0]
             if on_gpu:
                 fail(f"--sim_backend {args.sim_backend}: {reason} To do without: --sim_backend physx_cpu")
+            args.cuda = False
             print(f"the GPU is not used: {reason}")
-    if on_gpu and not args.cuda:
-        fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
     if on_gpu:
         try:
             sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
         except Exception as error:
             remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in str(error) else "see examples/check_machine.py"
             fail(f"--sim_backend {args.sim_backend}: PhysX cannot use the GPU ({error}): {remedy}")
+    try:
+        parse_backends(args.sim_backend, args.render_backend)
+    except (KeyError, ValueError, RuntimeError) as error:
+        fail(f"--render_backend {args.render_backend}: {error}; use gpu, gpu:N, cpu or none")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install wandb")
 
@@ -1029,38 +1031,43 @@ def check(args: Args) -> None:
     name = args.env_id.rpartition(":")[2]
     try:
         spec = find_task(args.env_id)
-    except ImportError as error:
-        fail(f"--env_id {args.env_id}: {error}")
     except KeyError:
         nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
         fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
-    defaults = {}  # of gym.make's arguments, by the task's class and those that it inherits from
-    for cls in reversed(spec.cls.__mro__[:-1]):
-        parameters = [*inspect.signature(cls.__init__).parameters.values()][1:]
-        defaults |= {p.name: p.default for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
-    defaults |= {"max_episode_steps": spec.max_episode_steps} | spec.default_kwargs
+    except Exception as error:  # the user's module
+        fail(f"--env_id {args.env_id}: {type(error).__name__}: {error}")
+    known = {"max_episode_steps"}.union(*(inspect.signature(cls.__init__).parameters for cls in spec.cls.__mro__))
     try:
-        settings = defaults | json.loads(args.env_kwargs)
+        env_kwargs = dict(**json.loads(args.env_kwargs))
     except (ValueError, TypeError):
         fail(f"--env_kwargs must be a JSON object like '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
-    unknown = settings.keys() - defaults.keys()
-    if unknown:
-        fail(f"--env_kwargs: {name} takes no {unknown.pop()}, but {', '.join(sorted(defaults))}")
+    for k in env_kwargs:
+        if hasattr(args, k):
+            fail(f"--env_kwargs: {k} has a flag of its own: --{k}")
+        if k not in known:
+            fail(f"--env_kwargs: {name} takes no {k}, but {', '.join(sorted(known - {'self', 'args', 'kwargs'}))}")
+    horizon = env_kwargs.get("max_episode_steps", spec.max_episode_steps)
+    if not (horizon is None or isinstance(horizon, int) and horizon > 0):
+        fail(f"--env_kwargs: max_episode_steps {horizon}: must be an integer of at least 1")
     if args.obs_mode not in spec.cls.SUPPORTED_OBS_MODES:
         fail(f"{name} has no observations of the state, only {', '.join(spec.cls.SUPPORTED_OBS_MODES)}")
     if args.reward_mode not in (None, *spec.cls.SUPPORTED_REWARD_MODES):
         fail(f"--reward_mode {args.reward_mode}: {name} has {', '.join(spec.cls.SUPPORTED_REWARD_MODES)}")
-    robots = args.robot_uids.split(",") if args.robot_uids else settings["robot_uids"]
+    own = inspect.signature(spec.cls.__init__).parameters.get(
+        "robot_uids"
+    )  # not those that it inherits: it may fix them
+    robots = (
+        args.robot_uids.split(",") if args.robot_uids else spec.default_kwargs.get("robot_uids", own and own.default)
+    )
     assets = [name]
-    robots = robots if isinstance(robots, (tuple, list)) else [robots]
-    for robot in [robot for robot in robots if isinstance(robot, str) and robot != "none"]:  # others bring a class
+    for robot in robots if isinstance(robots, (tuple, list)) else [robots]:
+        if not isinstance(robot, str) or robot == "none" and not args.robot_uids:
+            continue  # tasks may bring a class of their own
         if robot not in REGISTERED_AGENTS:
-            fail(
-                f"--robot_uids {robot}: no such robot, but {', '.join(spec.cls.SUPPORTED_ROBOTS or REGISTERED_AGENTS)}"
-            )
-        agent_cls = REGISTERED_AGENTS[robot].agent_cls
-        assets += REGISTERED_AGENTS[robot].asset_download_ids
-        with contextlib.suppress(AttributeError):  # some robots know their controllers only once they are built
+            fail(f"--robot_uids {robot}: no such robot, but {spec.cls.SUPPORTED_ROBOTS or [*REGISTERED_AGENTS]}")
+        assets.append(robot)
+        with contextlib.suppress(Exception):  # some robots know their controllers only once they are built
+            agent_cls = REGISTERED_AGENTS[robot].agent_cls
             modes = agent_cls.__new__(agent_cls)._controller_configs
             if args.control_mode not in (None, *modes):
                 fail(f"--control_mode {args.control_mode}: {robot} has {', '.join(modes)}")
@@ -1085,7 +1092,6 @@ def check(args: Args) -> None:
         fail(f"{run_dir} cannot be written: {error}")
 
     # --- what may be meant otherwise ---
-    horizon = settings["max_episode_steps"]
     if horizon and args.num_eval_steps and args.num_eval_steps < horizon:
         print(f"note: --num_eval_steps {args.num_eval_steps} ends before an episode does: all {horizon} steps are run")
     if not args.evaluate:
@@ -1135,6 +1141,7 @@ def prepare_rendering(args: Args) -> None:
 def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
     run_dir, device = find_run_dir(args), choose_device(args)
+    prepare_rendering(args)
     torch.set_num_threads(1)
     envs = make_envs(args, run_dir / "test_videos", evaluation=True)
     closing.callback(envs.close)
@@ -1160,10 +1167,20 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
 def train(args: Args, closing: contextlib.ExitStack) -> int:
     """The training run, from the folder to the last checkpoint; the loop stands here in one piece.
 
-    However it ends, `closing` keeps what was learned and ends the workers. Returns the exit code."""
+    However it ends from there on, `closing` keeps what was learned and ends the workers. Returns the exit code."""
     # --- environments, agent ---
+    for s in STOP_SIGNALS:
+        closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir, device = find_run_dir(args), choose_device(args)
+    given = asdict(args)  # a resumed run may find the renderer that this one lacks
+    prepare_rendering(args)
     resumed = load_checkpoint(args.resume) if args.resume else {}
+    first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
+    if first_iteration > args.num_iterations:
+        fail(f"--total_timesteps {args.total_timesteps} is less than the {global_step} steps of {args.resume}")
+    best_score = resumed.get("best_score", [-math.inf])
+    if resumed and (run_dir / "best.pt").exists():  # which may be newer than the checkpoint
+        best_score = max(best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
@@ -1184,8 +1201,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         optimizer.load_state_dict(resumed["optimizer"])
     elif args.checkpoint:
         load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
-    first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
-    best_score = resumed.get("best_score", [-math.inf])
 
     eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
     closing.callback(eval_envs.close)
@@ -1209,12 +1224,18 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
             config=about, save_code=True, id=wandb_id, resume="allow",
         ).id  # fmt: skip
-        closing.callback(wandb.finish)
-    metrics_file = closing.enter_context(open(run_dir / "metrics.jsonl", "ab"))
-    metrics_file.truncate(min(resumed.get("metrics_size", 0), metrics_file.tell()))  # rows of steps that are redone
+        closing.push(lambda error, *_: wandb.finish(exit_code=int(error is not None)))
+    metrics_file, writer = open(run_dir / "metrics.jsonl", "ab"), None
+    kept = (run_dir / "metrics.jsonl").read_bytes()[: resumed.get("metrics_size", 0)]  # later steps are done again
+    metrics_file.truncate(kept.rfind(b"\n") + 1)
     metrics_file.seek(0, os.SEEK_END)
-    writer = None
-    closing.callback(lambda: writer and writer.close())
+
+    @closing.callback
+    def close_files():
+        for file in (metrics_file, writer):
+            with contextlib.suppress(OSError, AttributeError):  # a full disk, of which was told; no writer yet
+                file.close()
+
     bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
     total = args.num_iterations * args.batch_size
     bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=None, bar_format=bar_format)
@@ -1226,8 +1247,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         nonlocal writer
         finite = {k: v for k, v in metrics.items() if math.isfinite(v)}
         row = {"kind": kind, "global_step": global_step, "time": time.time(), **finite}
-        if wandb:
-            wandb.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
         try:
             metrics_file.write(json.dumps(row).encode() + b"\n")
             metrics_file.flush()
@@ -1238,21 +1257,25 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         except OSError:  # the file keeps the row for the next flush; the writer is made anew from the file
             writer = None
             raise
+        finally:
+            if wandb:
+                wandb.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
 
-    def attempt(what: str, function, *arguments) -> None:
+    def attempt(what: str, function, *arguments) -> bool:
         """Write something; where that fails, as on a full disk, say so and go on, unless it fails again and again."""
         try:
             function(*arguments)
             failures[what] = 0
+            return True
         except OSError as error:
             failures[what] += 1
             bar.write(f"{what} could not be written, training goes on: {error}")
             if failures[what] == MAX_FAILURES:
                 raise RunError(f"{what} could not be written {MAX_FAILURES} times in a row: {error}") from None
+        return False
 
-    def save(name: str) -> None:
-        if args.save_model:
-            attempt(name, save_checkpoint, run_dir / name, snapshot)
+    def save(name: str, contents: dict) -> bool:
+        return not args.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
 
     # --- rollout storage ---
     shape = (args.num_steps, args.num_envs)
@@ -1260,8 +1283,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     actions = torch.zeros(*shape, act_dim, device=device)
     logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
 
-    # physics remember contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
-    rebuild = {"reconfigure": True} if args.exact_resume else None
+    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
+    rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
 
     # --- how it may end ---
     finished, stopped_by, failures = False, 0, Counter()
@@ -1272,38 +1295,35 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         stopped_by = signum
         for s in STOP_SIGNALS:
             signal.signal(s, signal.SIG_DFL)  # a second one ends the process at once
-        os.write(
-            2, f"\n{signal.Signals(signum).name}: stopping after this iteration, or at once if repeated\n".encode()
-        )
+        os.write(2, f"\n{signal.Signals(signum).name}: stopping after this iteration; again: at once\n".encode())
 
     for s in STOP_SIGNALS:
-        closing.callback(signal.signal, s, signal.signal(s, stop))
+        signal.signal(s, stop)
 
     @closing.callback
     def save_last():
-        if finished or not args.exact_resume:  # which continues where last.pt was written anyway
-            save("last.pt")
+        if finished or not args.exact_resume:  # with it, a run goes on from a boundary only
+            save("last.pt", snapshot)
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
-        # --- checkpoint: here a resumed run goes on, and hither an update that goes wrong is taken back ---
+        # --- checkpoint: here a resumed run goes on, and to here an update that goes wrong is taken back ---
         snapshot = copy.deepcopy(
             {
                 "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "iteration": iteration,
                 "global_step": global_step, "best_score": best_score, "metrics_size": metrics_file.tell(),
-                "wandb_id": wandb_id, "args": about["args"], "versions": about["versions"],
+                "wandb_id": wandb_id, "args": given, "versions": about["versions"],
             }
         )  # fmt: skip
         minutes = (time.monotonic() - last_saved) / 60
         if iteration % args.checkpoint_freq == 0 or (minutes > args.checkpoint_minutes and not args.exact_resume):
-            save("last.pt")
+            save("last.pt", snapshot)
             last_saved = time.monotonic()
         if args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
-            save(f"iteration_{iteration}.pt")
+            save(f"iteration_{iteration}.pt", snapshot)
 
         # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
-        finished = iteration == args.num_iterations
-        due = finished or iteration == 0 or (args.eval_freq and iteration % args.eval_freq == 0)
-        if due and not stopped_by:
+        finished = iteration == args.num_iterations and not stopped_by
+        if finished or not stopped_by and (iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0):
             episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
             metrics = {key: value.mean().item() for key, value in episodes.items()}
             attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": num_eval_episodes})
@@ -1311,22 +1331,21 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
             best = score > best_score and all(map(math.isfinite, score))
             bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
-            if best:
+            if best and save("best.pt", snapshot | {"best_score": score}):
                 best_score = score
-                save("best.pt")
             attempt("learning_curve.png", plot_learning_curve, run_dir)
             if args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success:
                 finished = True
         if finished or stopped_by:
             break
 
-        # --- rollout: num_steps in every environment; its randomness follows from seed and iteration alone ---
+        # --- rollout: num_steps in every environment; its noise follows from seed and iteration alone ---
         start = time.perf_counter()
+        seed_all(args.seed, iteration)
         if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
             seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
             next_obs, _ = envs.reset(seed=(seeds // 2 + 2**31).tolist(), options=rebuild)  # evaluation's lie below 2^31
             next_obs = next_obs.to(device)
-        seed_all(args.seed, iteration)
         episode_sums, num_episodes = {}, torch.zeros((), device=device)
         for step in range(args.num_steps):
             obs[step] = next_obs
@@ -1361,7 +1380,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             names = [name for name, row in zip(quantities, broken) if row.any()]
             env_idx = broken.any(0).nonzero().flatten()
             problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
-            next_obs, _ = envs.reset(options={"env_idx": env_idx.to(envs.device)})
+            # scenes that are rebuilt now and then are so all at once
+            next_obs, _ = envs.reset(
+                options=None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
+            )
             next_obs = next_obs.to(device)
         rollout_time = time.perf_counter() - start
 
@@ -1391,8 +1413,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         metrics = {}
         if update_metrics:
             metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
-            if not all(map(math.isfinite, metrics.values())):
-                problem = "non-finite loss or gradient"
+            healthy = torch.stack([x.isfinite().all() for x in agent.state_dict().values()]).all()
+            if not (healthy and all(map(math.isfinite, metrics.values()))):
+                problem = "non-finite loss, gradient or normalisation"
                 agent.load_state_dict(snapshot["agent"])
                 optimizer.load_state_dict(copy.deepcopy(snapshot["optimizer"]))
         if episode_sums:
@@ -1439,13 +1462,14 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 def main(argv: list[str]) -> int:
     args = parse_args(argv)
     check(args)
-    prepare_rendering(args)
     try:
         with contextlib.ExitStack() as closing:
             code = (evaluate_checkpoint if args.evaluate else train)(args, closing)
     except RunError as error:
         print(f"ppo.py: {error}", file=sys.stderr)
         code = 1
+    except KeyboardInterrupt:  # before the loop, which has a better way to stop
+        code = 130
     except Exception:
         traceback.print_exc()
         code = 1

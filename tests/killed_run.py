@@ -20,7 +20,7 @@ import ppo
 
 ARGS = dict(
     env_id="Reach", sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
-    total_timesteps=16 * 10 * 400, num_minibatches=2, eval_freq=25, capture_video=False, cuda=False, norm_obs=True,
+    total_timesteps=16 * 10 * 350, num_minibatches=2, eval_freq=25, capture_video=False, cuda=False, norm_obs=True,
     anneal_lr=True, checkpoint_freq=3, exact_resume=True,
 )  # fmt: skip
 
@@ -49,7 +49,7 @@ if __name__ == "__main__":
     metrics, progress = Path("runs/killed/metrics.jsonl"), []
     for _ in range(50):
         rows = metrics.read_bytes().count(b"\n") if metrics.exists() else 0
-        pid, goal = resume_or_start(), rows + random.randrange(12)
+        pid, goal = resume_or_start(), rows + random.randrange(10)
         deadline = time.monotonic() + 20
         time.sleep(random.uniform(0.0, 0.2))  # while it starts, often
         while metrics.exists() and metrics.read_bytes().count(b"\n") < goal and time.monotonic() < deadline:

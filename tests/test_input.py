@@ -1,6 +1,7 @@
 """Bad input is refused before anything is built: exit code 2, one line, nothing written. Good input runs."""
 
 import random
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def refused(arguments, capsys):
         ("--env_kwargs [1]", "env_kwargs"),
         ("--env_kwargs {", "env_kwargs"),
         ('--env_kwargs {"colour":1}', "takes no colour, but"),
+        ('--env_kwargs {"num_envs":1}', "--num_envs"),
+        ('--env_kwargs {"max_episode_steps":-5}', "max_episode_steps -5"),
+        ('--env_kwargs {"max_episode_steps":[1]}', "max_episode_steps [1]"),
+        ("--env_id TwoRobotPickCube-v1 --robot_uids foo", "panda_wristcam"),
+        ("--env_id .x:Y", ".x:Y"),
+        ("--env_id broken:Task-v1", "ZeroDivisionError"),
+        ("--robot_uids none", "robot_uids"),
+        ("--env_id PickCube-v1 --robot_uids xarm6_robotiq", "download_asset xarm6_robotiq"),
         ("--evaluate", "--checkpoint"),
         ("--evaluate --checkpoint nowhere.pt", "nowhere.pt"),
         ("--evaluate --checkpoint garbage.pt", "garbage.pt"),
@@ -66,9 +75,12 @@ def refused(arguments, capsys):
                      marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has one")),
     ],
 )  # fmt: skip
-def test_bad_input(arguments, message, in_tmp, capsys):
+def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
     (in_tmp / "garbage.pt").write_bytes(b"not a checkpoint")
     (in_tmp / "runs/there").mkdir(parents=True)
+    (in_tmp / "broken.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(in_tmp)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (in_tmp / "runs/there/metrics.jsonl").write_text("{}\n")
     line = refused(["--no-cuda", "--no-capture_video", *arguments.split()], capsys)
     assert any(part in line for part in message.split("|")), line
@@ -127,7 +139,7 @@ VALID = {
     "eval_freq": [0, 1, 2], "num_eval_steps": [None, 1, 100], "eval_seed": [0, 2**30], "stop_at_success": [None, 0, 1],
     "save_freq": [None, 1], "checkpoint_freq": [1, 3], "checkpoint_minutes": [1e-6, 100], "exp_name": ["x", "a/b c"],
     "reward_mode": [None, "sparse", "dense"], "control_mode": [None, "pd_ee_delta_pose"], "robot_uids": [None, "panda"],
-    "env_kwargs": ["{}", '{"max_episode_steps": 30}'], "render_backend": ["none", "cpu", "gpu:0"],
+    "env_kwargs": ["{}", '{"max_episode_steps": 30}'], "render_backend": ["none", "cpu", "gpu"],
     "sim_backend": ["cpu", "physx_cpu"], "reconfiguration_freq": [None, 0, 1], "render_mode": ["all", "sensors"],
     "shader": ["minimal"], "wandb_entity": [None, "us"], "total_timesteps": [126, 500],
 }  # fmt: skip
@@ -143,7 +155,7 @@ INVALID = {
     **{flag: NUMBERS[1:] for flag in ("seed", "eval_freq", "ent_coef", "vf_coef", "target_kl", "eval_seed")},
     **{flag: [*NUMBERS[1:], "1.1"] for flag in ("gamma", "gae_lambda", "stop_at_success")},
     "logstd_init": ["nan", "inf", "?"], "total_timesteps": ["0", "3", "-5", "1e5x"],
-    "env_kwargs": ["", "{", "[]", '{"a": 1}'],
+    "env_kwargs": ["", "{", "[]", '{"a": 1}', '{"num_envs": 3}', '{"max_episode_steps": 0}'],
     "env_id": ["", "PushCube", "pushcube-v1", ":", "a:b:c", "os:PushCube-v9"], "control_mode": ["", "pd"],
     "robot_uids": ["r2d2", "panda,r2d2"], "obs_mode": ["rgb", ""], "reward_mode": ["best"],
     "sim_backend": ["", "gazebo"], "bootstrap_at_done": ["sometimes"], "render_backend": ["gpu:", "vulkan"],
