@@ -1454,8 +1454,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         return 128 + stopped_by
     closing.close()
     merge_recorded(run_dir / "videos")
-    print(f"learning curve, videos and metrics are in {run_dir}; to evaluate the best policy on other episodes:")
-    print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
+    print(f"learning curve, videos and metrics are in {run_dir}")
+    if args.save_model:
+        print("to evaluate the best policy on other episodes:")
+        print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
     return 0
 
 

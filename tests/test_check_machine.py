@@ -25,6 +25,7 @@ def test_without_vulkan():
     assert all(f"ok       {package} " in table for package in ("mani-skill", "sapien", "torch", "psutil"))
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_with_vulkan():
     table = check_machine()

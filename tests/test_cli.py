@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, run_script
+from conftest import NO_VULKAN, ROOT, run_script, same_weights
 
 import ppo
 
@@ -168,9 +168,7 @@ def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "env_id", ["TwoRobotPickCube-v1", "MS-HopperHop-v1", "RotateValveLevel0-v1", "DrawTriangle-v1", "PullCubeTool-v1"]
-)
+@pytest.mark.parametrize("env_id", ["TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1"])
 def test_other_kinds_of_task(env_id, tmp_path):
     """Dict action spaces, tasks without success, other robots, sparse reward: built and trained without Vulkan."""
     process = run_script(
@@ -210,29 +208,33 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
     text = re.sub(r"\x1b\[[0-9;]*[A-Za-z]", "", output.decode()).replace("\r\n", "\n")
     # what stays on a line is what came after the last carriage return
     staying = [line.rpartition("\r")[2] for line in text.split("\n") if line.rpartition("\r")[2].strip()]
-    kinds = ["no videos", "PushCube-v1", "writing to", "step", "step", "step", "100%", "learning curve", "python"]
+    kinds = [
+        "no videos",
+        "PushCube-v1",
+        "writing to",
+        "step",
+        "step",
+        "step",
+        "100%",
+        "learning curve",
+        "to evaluate",
+        "python",
+    ]
     assert [kind for kind, line in zip(kinds, staying) if kind in line] == kinds, staying
     assert len(staying) == len(kinds)
     bars = [piece for piece in text.replace("\n", "\r").split("\r") if "steps/s" in piece]
     assert bars and all("return" in piece and "<" in piece for piece in bars), "step, time left, rate and return"
 
 
-def test_one_environment_in_this_process(tmp_path):
-    process = run_script(*TINY, "--num_envs", 1, "--num_eval_envs", 1, cwd=tmp_path, env=NO_VULKAN)
-    assert process.returncode == 0, process.stderr
-
-
 @pytest.mark.slow
 def test_weights_do_not_depend_on_evaluation_with_the_pool(tmp_path):
-    """The same through real tasks: one environment in the process, and the pool."""
-    for num_envs in (1, 4):
-        for freq in (1, 0):
-            name = f"{num_envs}-{freq}"
-            flags = (*TINY, "--num_envs", num_envs, "--num_eval_envs", num_envs, "--total_timesteps", 160)
-            process = run_script(*flags, "--exp-name", name, "--eval_freq", freq, cwd=tmp_path, env=NO_VULKAN)
-            assert process.returncode == 0, process.stderr
-        a, b = [ppo.load_checkpoint(tmp_path / f"runs/{num_envs}-{freq}/last.pt")["agent"] for freq in (1, 0)]
-        assert all(torch.equal(a[k], b[k]) for k in a)
+    """The same through real tasks: training in the pool, evaluation in the process, where it could disturb."""
+    for freq in (1, 0):
+        flags = (*TINY, "--num_envs", 4, "--total_timesteps", 160, "--exp-name", freq, "--eval_freq", freq)
+        process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
+        assert process.returncode == 0, process.stderr
+    a, b = [ppo.load_checkpoint(tmp_path / f"runs/{freq}/last.pt") for freq in (1, 0)]
+    assert same_weights(a, b)
 
 
 def frames(path):

@@ -41,8 +41,16 @@ def play(envs, seeds, actions, before_reset=lambda seeds: None):
     return steps
 
 
-@pytest.mark.parametrize("partial_reset", [True, False])
-@pytest.mark.parametrize("env_id", ["PushCube-v1", "PickCube-v1", "MS-CartpoleBalance-v1", "RollBall-v1"])
+@pytest.mark.parametrize(
+    "env_id, partial_reset",
+    [
+        ("PushCube-v1", True),
+        ("PushCube-v1", False),
+        ("PickCube-v1", True),
+        ("MS-CartpoleBalance-v1", True),
+        ("RollBall-v1", True),
+    ],
+)
 def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
     """Episodes end by success or failure at different times, and by the time limit; then the environments reset
     themselves from their own random streams."""

@@ -1,6 +1,7 @@
 """Stopping, continuing and failing: on the torch-native environments in this process where that shows it, else through
 the command with real tasks."""
 
+import contextlib
 import errno
 import os
 import re
@@ -10,13 +11,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import batched_env
 import psutil
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, SMALL, read_metrics, run_script, same_weights
 
 import ppo
 
@@ -209,6 +212,18 @@ def test_checkpoint_minutes(train, in_update, in_tmp):
     assert saved["late"] == 8
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("first, second", [("cuda", "cpu"), ("cpu", "cuda")])
+def test_checkpoints_move_between_devices(in_tmp, monkeypatch, first, second):
+    for device, flags in ((first, dict(exp_name="x", total_timesteps=640)), (second, dict(resume="runs/x/last.pt"))):
+        monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device=device))
+        args = replace(SMALL, total_timesteps=1280, cuda=device == "cuda")
+        with contextlib.ExitStack() as closing:
+            assert ppo.train(replace(args, **flags), closing) == 0
+    last = ppo.load_checkpoint("runs/x/last.pt")
+    assert last["iteration"] == 4 and all(x.device.type == "cpu" for x in last["agent"].values())
+
+
 # --- numbers that are not finite ---
 
 
@@ -363,8 +378,6 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, how, flag, c
     before = sorted(Path("runs").rglob("*"))
     arguments = {"--resume": ["--resume", path], "--checkpoint": ["--checkpoint", path, "--num_envs", 1],
                  "--evaluate": ["--evaluate", "--checkpoint", path, "--num_eval_envs", 1]}[flag]  # fmt: skip
-    if flag == "--resume" and how in ("task", "network"):
-        arguments += ["--num_eval_envs", 1]
     with pytest.raises(SystemExit) as error:
         ppo.main([*map(str, arguments), "--no-cuda", "--no-capture_video"])
     assert error.value.code == 2
@@ -442,6 +455,8 @@ def test_signals_finish_the_iteration(start, tmp_path, signum):
     rows, last = read_metrics(tmp_path / "runs/x"), ppo.load_checkpoint(tmp_path / "runs/x/last.pt")
     assert rows[-1]["kind"] == "train" and rows[-1]["iteration"] == last["iteration"] >= 1
     assert not list((tmp_path / "runs/x").glob("*.tmp"))
+    if signum != signal.SIGTERM:
+        return
     steps = last["global_step"] + 80
     again = run_script("--resume", "runs/x", "--total_timesteps", steps, cwd=tmp_path, env=NO_VULKAN)
     assert again.returncode == 0 and f"resuming runs/x at step {last['global_step']:,}" in again.stdout, again.stderr
