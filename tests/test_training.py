@@ -11,16 +11,15 @@ from conftest import SMALL, same_weights
 import ppo
 
 
+TEXTBOOK = dict(bootstrap_at_done="truncated", partial_reset=False, norm_obs=True, anneal_lr=True)
+FINITE_HORIZON = dict(finite_horizon_gae=True, shared_features=True, clip_vloss=True, target_kl=None)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
-    "flags",
-    [
-        {},
-        dict(bootstrap_at_done="truncated", partial_reset=False, norm_obs=True, anneal_lr=True),
-        dict(finite_horizon_gae=True, shared_features=True, clip_vloss=True, target_kl=None),
-    ],
-    ids=["default", "textbook", "finite-horizon"],
+    "flags, seed",
+    [({}, 1), ({}, 2), ({}, 3), (TEXTBOOK, 1), (FINITE_HORIZON, 1)],
+    ids=["default-1", "default-2", "default-3", "textbook", "finite-horizon"],
 )
 def test_learns(train, flags, seed):
     metrics, *_ = train(seed=seed, total_timesteps=60_000, eval_freq=0, learning_rate=1e-3, update_epochs=8, **flags)
