@@ -470,7 +470,9 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
 
     def batch(infos):
         return {
-            k: torch.cat([torch.atleast_1d(info[k]) for info in infos]).numpy() if isinstance(v, torch.Tensor) else v
+            k: (torch.cat if v.ndim else torch.stack)([info[k] for info in infos]).numpy()
+            if isinstance(v, torch.Tensor)
+            else v
             for k, v in (infos[0].items() if infos else ())
         }
 

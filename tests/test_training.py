@@ -10,7 +10,6 @@ from conftest import SMALL, same_weights
 
 import ppo
 
-
 TEXTBOOK = dict(bootstrap_at_done="truncated", partial_reset=False, norm_obs=True, anneal_lr=True)
 FINITE_HORIZON = dict(finite_horizon_gae=True, shared_features=True, clip_vloss=True, target_kl=None)
 
