@@ -102,22 +102,16 @@ def read(path: str) -> str:
         return ""
 
 
-def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> bool:
+def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> None:
     """Print one line of the table: ok, missing, or (None) neither good nor bad."""
     print(f"{ {True: 'ok     ', False: 'missing', None: '       '}[good] }  {name:<26}{found}")
     if good is False and remedy:
         print(f"{'':<35}-> {remedy}")
-    return bool(good)
 
 
 def main() -> None:
-    good = (3, 10) <= sys.version_info[:2] <= (3, 12)
-    row(
-        good,
-        "Python",
-        platform.python_version(),
-        "use Python 3.10, 3.11 or 3.12: mani-skill's dependencies have no other",
-    )
+    remedy = "use Python 3.10, 3.11 or 3.12: mani-skill's dependencies have no other"
+    row((3, 10) <= sys.version_info[:2] <= (3, 12), "Python", platform.python_version(), remedy)
     for package in PACKAGES:
         row(version(package) is not None, package, version(package) or "not installed", f"pip install {package}")
     row(None, "wandb (for --track)", version("wandb") or "not installed")
@@ -157,21 +151,20 @@ def main() -> None:
     row(vulkan, "Vulkan", found, remedy)
 
     print("\nwhat therefore works (tried):")
-    render = {True: "gpu", False: "none"}
-    for name, obs_mode, sim_backend, possible in (
-        ("state, CPU simulation", "state", "physx_cpu", True),
-        ("images, CPU simulation", "rgb", "physx_cpu", vulkan),
-        ("state, GPU simulation", "state", "physx_cuda", cuda and libcuda and physx),
-        ("images, GPU simulation", "rgb", "physx_cuda", cuda and libcuda and physx and vulkan),
+    gpu = cuda and libcuda and physx
+    for name, possible, num_envs, sim_backend, obs_mode, render_backend in (
+        ("state, CPU simulation", True, 1, "physx_cpu", "state", "none"),
+        ("images, CPU simulation", vulkan, 1, "physx_cpu", "rgb", "gpu"),
+        ("state, GPU simulation", gpu, 2, "physx_cuda", "state", "none"),
+        ("images, GPU simulation", gpu and vulkan, 2, "physx_cuda", "rgb", "gpu"),
     ):
         if not possible:
             row(None, name, "no: see above")
             continue
-        num_envs = 2 if sim_backend == "physx_cuda" else 1
         code = SIMULATE.format(root=str(ROOT), num_envs=num_envs, obs_mode=obs_mode, sim_backend=sim_backend,
-                               render_backend=render[obs_mode == "rgb"])  # fmt: skip
-        good, found = attempt(code)
-        row(good, name, found)
+                               render_backend=render_backend)  # fmt: skip
+        works, found = attempt(code)
+        row(works, name, found)
 
 
 if __name__ == "__main__":

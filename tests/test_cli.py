@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
 
 import ppo
 
@@ -36,7 +36,7 @@ def test_inline_metadata_equals_pyproject():
 
 def test_run_folder(trained):
     folder, process = trained
-    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    rows = read_metrics(folder)
     train_rows = [row for row in rows if row["kind"] == "train"]
     evaluations = [row for row in rows if row["kind"] == "eval"]
     assert [row["global_step"] for row in train_rows] == [80, 160, 240, 320, 400]
@@ -65,7 +65,7 @@ def test_tensorboard_holds_the_same_numbers(trained):
     folder, _ = trained
     events = EventAccumulator(str(folder))
     events.Reload()
-    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    rows = read_metrics(folder)
     for kind, key in (("train", "sps"), ("train", "value_loss"), ("eval", "return")):
         logged = [(e.step, e.value) for e in events.Scalars(f"{kind}/{key}")]
         expected = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind]
@@ -175,7 +175,7 @@ def test_other_kinds_of_task(env_id, tmp_path):
         *TINY, "--env_id", env_id, "--env_kwargs", '{"max_episode_steps": 10}', cwd=tmp_path, env=NO_VULKAN
     )
     assert process.returncode == 0, process.stderr
-    rows = [json.loads(line) for line in (tmp_path / "runs/tiny/metrics.jsonl").read_text().splitlines()]
+    rows = read_metrics(tmp_path / "runs/tiny")
     assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
     assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
 
@@ -281,6 +281,6 @@ def test_the_main_job(tmp_path):
     flags = ("--seed", 1, "--exp-name", "main", "--no-cuda", "--total_timesteps", 150_000, "--stop_at_success", 0.95)
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN, timeout=1200)
     assert process.returncode == 0, process.stderr
-    rows = [json.loads(line) for line in (tmp_path / "runs/main/metrics.jsonl").read_text().splitlines()]
+    rows = read_metrics(tmp_path / "runs/main")
     evaluations = [row["success_once"] for row in rows if row["kind"] == "eval"]
     assert evaluations[0] < 0.2 and evaluations[-1] >= 0.9 and evaluations[-1] >= max(evaluations) - 0.1
