@@ -80,6 +80,7 @@ def find_render_device() -> Optional[sapien.Device]:
     return None
 
 
+SCRIPT = Path(__file__)
 RENDER_DEVICE = find_render_device()
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
 MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
@@ -100,7 +101,6 @@ if RENDER_DEVICE is None:
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
 from mani_skill.agents.registration import REGISTERED_AGENTS
-from mani_skill.trajectory.merge_trajectory import merge_trajectories
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
@@ -121,8 +121,8 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
 
-# what concerns no user: the render device is replaced above, trajectories are merged on purpose, robots are as they are
-NOISE = "Requested to use render device|mani_skill is not installed with git|Merging|Conflict detected|"
+# what concerns no user: the render device is replaced above, robots are as they are
+NOISE = "Requested to use render device|mani_skill is not installed with git|"
 NOISE += "Currently ManiSkill does not support loading plane|No initial pose set for"
 mani_skill.logger.addFilter(lambda record: not re.match(NOISE, record.getMessage()))
 
@@ -261,7 +261,8 @@ class Args:
     save_train_video_freq: Optional[int] = None
     """film training every so many iterations (on a GPU all environments, as tiles: keep num_envs small)"""
     save_trajectory: bool = False
-    """write the evaluation episodes as ManiSkill trajectories, beside the videos"""
+    """write evaluation episodes as ManiSkill trajectories, beside the videos: one file, or on a CPU one an environment
+    (python -m mani_skill.trajectory.merge_trajectory joins them)"""
 
     # --- runtime ---
     compile: bool = False
@@ -287,8 +288,10 @@ CPU_DEFAULTS = dict(
     eval_freq=15,
 )  # fmt: skip
 
-# flags that a resumed run may be given anew; --evaluate takes those of the machine from the command line, not the run
+# --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
+# of the network from the checkpoint; a resumed run may be given only some anew
 OF_THE_MACHINE = {"cuda", "sim_backend", "render_backend", "num_eval_envs", "capture_video", "save_trajectory", "track"}
+OF_THE_NETWORK = ("norm_obs", "shared_features")
 MAY_CHANGE = OF_THE_MACHINE | {
     "total_timesteps", "stop_at_success", "eval_freq", "save_model", "save_freq", "checkpoint_freq",
     "checkpoint_minutes", "save_train_video_freq", "render_mode", "shader", "wandb_project_name", "wandb_entity",
@@ -298,7 +301,7 @@ MAY_CHANGE = OF_THE_MACHINE | {
 
 def fail(message: str) -> NoReturn:
     """Refuse bad input: one line, exit code 2."""
-    print(f"ppo.py: {' '.join(message.split())}", file=sys.stderr)
+    print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -338,7 +341,7 @@ def parse_args(argv: list[str]) -> Args:
     elif args.evaluate or args.checkpoint is not None:
         stored = load_checkpoint(args.checkpoint)["args"]
         of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
-        kept = stored.keys() - of_this_evaluation if args.evaluate else ("norm_obs", "shared_features")
+        kept = stored.keys() - of_this_evaluation if args.evaluate else OF_THE_NETWORK
     args = parse(argv, replace(default, **{k: stored[k] for k in kept if hasattr(default, k)}))
     if args.resume is not None:
         for k in kept - MAY_CHANGE:
@@ -348,7 +351,7 @@ def parse_args(argv: list[str]) -> Args:
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
     if args.exp_name is None:
-        args.exp_name = f"{args.env_id.split(':')[-1]}__ppo__{args.seed}__{int(time.time())}"
+        args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     return args
 
 
@@ -452,6 +455,11 @@ def stream_seed(seed: int) -> int:
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) | 2**31
 
 
+def as_dict(obs) -> dict:
+    """Observations by name, also where there is one only."""
+    return obs if isinstance(obs, (dict, gym.spaces.Dict)) else {"state": obs}
+
+
 def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
     """Body of a worker process: build the environments `indices`, then answer each message with one message.
 
@@ -484,7 +492,9 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
                 streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
                 np.random.seed(seed)
                 random.seed(seed)
-            reset_obs[i : i + 1], info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
+            first_obs, info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
+            for k, v in as_dict(first_obs).items():
+                reset_obs[k][i] = v[0]
             infos.append(info)
         return batch(infos)
 
@@ -498,7 +508,9 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
         spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
         conn.send((spaces, find_max_episode_steps_value(envs[0])))
         share = slice(indices[0], indices[-1] + 1)
-        obs, reset_obs, rewards, terminated, truncated, actions = [buffer[share] for buffer in conn.recv()]
+        obs, reset_obs, *others = conn.recv()
+        obs, reset_obs = [{k: v[share] for k, v in buffers.items()} for buffers in (obs, reset_obs)]
+        rewards, terminated, truncated, actions = [buffer[share] for buffer in others]
         while True:
             try:
                 command, *arguments = conn.recv()
@@ -506,8 +518,10 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
                 break
             if command == "step":
                 results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
-                *tensors, infos = zip(*results)
-                for buffer, rows in zip((obs, rewards, terminated, truncated), tensors):
+                next_obs, *tensors, infos = zip(*results)
+                for k, buffer in obs.items():
+                    torch.cat([as_dict(x)[k] for x in next_obs], out=buffer)
+                for buffer, rows in zip((rewards, terminated, truncated), tensors):
                     torch.cat(rows, out=buffer)
                 infos = batch(infos)  # before the resets, which write into the same tensors
                 ended = truncated if ignore_terminations else terminated | truncated
@@ -521,6 +535,10 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
             conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
     for env in envs:
         env.close()
+
+
+def to_device(obs, device):
+    return {k: v.to(device) for k, v in obs.items()} if isinstance(obs, dict) else obs.to(device)
 
 
 class CPUVectorEnv(gym.Env):
@@ -574,11 +592,14 @@ class CPUVectorEnv(gym.Env):
             raise
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
-        obs, actions = [torch.zeros(num_envs, *space.shape) for space in spaces]
-        flags = torch.zeros(num_envs, dtype=torch.bool)
-        buffers = [obs, obs.clone(), torch.zeros(num_envs), flags, flags.clone(), actions]
-        self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions = buffers
-        for buffer in buffers:
+        self.obs, self.reset_obs = [
+            {k: torch.from_numpy(np.zeros((num_envs, *s.shape), s.dtype)) for k, s in as_dict(spaces[0]).items()}
+            for _ in range(2)
+        ]
+        self.rewards, self.actions = torch.zeros(num_envs), torch.zeros(num_envs, *spaces[1].shape)
+        self.terminated, self.truncated = torch.zeros(2, num_envs, dtype=torch.bool)
+        buffers = [self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions]
+        for buffer in (*self.obs.values(), *self.reset_obs.values(), *buffers[2:]):
             buffer.share_memory_()
         self._send([buffers] * len(self.conns))
         self.infos, self.reset_infos = {}, []
@@ -606,6 +627,10 @@ class CPUVectorEnv(gym.Env):
             for k, v in infos[0].items()
         }
 
+    def _observation(self):
+        obs = {k: v.clone() for k, v in self.obs.items()}
+        return obs if isinstance(self.single_observation_space, gym.spaces.Dict) else obs["state"]
+
     @property
     def elapsed_steps(self) -> torch.Tensor:
         return self.infos["elapsed_steps"]
@@ -615,7 +640,8 @@ class CPUVectorEnv(gym.Env):
         self._send([("step",)] * len(self.conns))
         infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
         self.infos = self._concatenate(infos)
-        return self.obs.clone(), self.rewards.clone(), self.terminated.clone(), self.truncated.clone(), dict(self.infos)
+        results = [x.clone() for x in (self.rewards, self.terminated, self.truncated)]
+        return self._observation(), *results, dict(self.infos)
 
     def reset(self, *, seed=None, options=None):
         options = dict(options or {})
@@ -633,8 +659,9 @@ class CPUVectorEnv(gym.Env):
             if isinstance(v, torch.Tensor) and len(env_idx) < self.num_envs:
                 infos[k] = self.infos[k].index_copy(0, env_idx, v)
         self.infos = infos
-        self.obs[env_idx] = self.reset_obs[env_idx]
-        return self.obs.clone(), dict(infos)
+        for k, obs in self.obs.items():
+            obs[env_idx] = self.reset_obs[k][env_idx]
+        return self._observation(), dict(infos)
 
     def close(self):
         for conn in self.conns:
@@ -684,8 +711,9 @@ class Agent(nn.Module):
 
     Observations are float32 (batch, obs_dim), actions (batch, act_dim), values and log-probabilities (batch,)."""
 
-    def __init__(self, obs_dim: int, act_dim: int, args: Args):
+    def __init__(self, obs_space: gym.spaces.Box, action_space: gym.spaces.Box, args: Args):
         super().__init__()
+        obs_dim, act_dim = obs_space.shape[0], action_space.shape[0]
 
         def features():
             return nn.Sequential(
@@ -841,7 +869,7 @@ def evaluate(
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
         episodes = {}
         for step in range(1, num_steps + 1):
-            action = agent.get_action(obs.to(device)).clamp(low, high).nan_to_num()
+            action = agent.get_action(to_device(obs, device)).clamp(low, high).nan_to_num()
             obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
             ended = running & (terminated | truncated | (step == num_steps))
             running &= ~ended
@@ -915,16 +943,6 @@ def name_videos(folder: Path, name: str) -> list[Path]:
     numbered = sorted(path for path in folder.glob("*.mp4") if path.stem.isdigit())
     names = [f"{name}.mp4" if len(numbered) == 1 else f"{name}_{i}.mp4" for i in range(len(numbered))]
     return [path.replace(folder / new) for path, new in zip(numbered, names)]
-
-
-def merge_recorded(folder: Path) -> None:
-    """One trajectory.h5 (and .json) from the files that the environments wrote each for itself."""
-    parts = sorted(folder.glob("trajectory_*.h5"), key=lambda path: int(path.stem.split("_")[1]))
-    if parts:
-        merge_trajectories(str(folder / "trajectory.h5"), parts)
-        for part in parts:
-            part.unlink()
-            part.with_suffix(".json").unlink()
 
 
 def read_metrics(run_dir: Path) -> Iterator[dict]:
@@ -1010,18 +1028,15 @@ def check(args: Args) -> None:
     if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
         try:
             torch.zeros(1, device=choose_device(args) if on_gpu else "cuda")
-        except Exception as error:  # no driver, one too old for this torch, no such device
+            if on_gpu:
+                sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
+        except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]
             if on_gpu:
-                fail(f"--sim_backend {args.sim_backend}: {reason} To do without: --sim_backend physx_cpu")
+                remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in reason else "see examples/check_machine.py"
+                fail(f"--sim_backend {args.sim_backend}: {reason}: {remedy}, or use --sim_backend physx_cpu")
             args.cuda = False
             print(f"the GPU is not used: {reason}")
-    if on_gpu:
-        try:
-            sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
-        except Exception as error:
-            remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in str(error) else "see examples/check_machine.py"
-            fail(f"--sim_backend {args.sim_backend}: PhysX cannot use the GPU ({error}): {remedy}")
     try:
         parse_backends(args.sim_backend, args.render_backend)
     except (KeyError, ValueError, RuntimeError) as error:
@@ -1051,18 +1066,16 @@ def check(args: Args) -> None:
     horizon = env_kwargs.get("max_episode_steps", spec.max_episode_steps)
     if not (horizon is None or isinstance(horizon, int) and horizon > 0):
         fail(f"--env_kwargs: max_episode_steps {horizon}: must be an integer of at least 1")
-    if args.obs_mode not in spec.cls.SUPPORTED_OBS_MODES:
-        fail(f"{name} has no observations of the state, only {', '.join(spec.cls.SUPPORTED_OBS_MODES)}")
     if args.reward_mode not in (None, *spec.cls.SUPPORTED_REWARD_MODES):
         fail(f"--reward_mode {args.reward_mode}: {name} has {', '.join(spec.cls.SUPPORTED_REWARD_MODES)}")
-    own = inspect.signature(spec.cls.__init__).parameters.get(
-        "robot_uids"
-    )  # not those that it inherits: it may fix them
-    robots = (
-        args.robot_uids.split(",") if args.robot_uids else spec.default_kwargs.get("robot_uids", own and own.default)
-    )
+    # not the parameters that it inherits: it may fix them
+    own = inspect.signature(spec.cls.__init__).parameters.get("robot_uids")
+    robots = args.robot_uids or spec.default_kwargs.get("robot_uids", own and own.default)
     assets = [name]
-    for robot in robots if isinstance(robots, (tuple, list)) else [robots]:
+    robots = robots.split(",") if isinstance(robots, str) else robots
+    robots = robots if isinstance(robots, (tuple, list)) else [robots]
+    check_observations(args, spec, robots)
+    for robot in robots:
         if not isinstance(robot, str) or robot == "none" and not args.robot_uids:
             continue  # tasks may bring a class of their own
         if robot not in REGISTERED_AGENTS:
@@ -1104,6 +1117,11 @@ def check(args: Args) -> None:
                   f"have {horizon}: about {1 - 10 / max(horizon, 20):.3g} may suit it better")  # fmt: skip
 
 
+def check_observations(args: Args, spec, robots: list) -> None:
+    if args.obs_mode not in spec.cls.SUPPORTED_OBS_MODES:
+        fail(f"--env_id {args.env_id} has no observations of the state, only {', '.join(spec.cls.SUPPORTED_OBS_MODES)}")
+
+
 def choose_device(args: Args) -> torch.device:
     """Where the agent learns: with the simulation on its GPU, else on any GPU there is, else on the CPU."""
     if args.sim_backend.startswith("physx_cuda"):
@@ -1111,15 +1129,21 @@ def choose_device(args: Args) -> torch.device:
     return torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
 
 
-def summary(metrics: dict) -> str:
+def summary(metrics: dict) -> list[str]:
     """The metrics that a person follows, in a few words."""
     names = {"success_once": "success", "return": "return", "episode_len": "length"}
-    return ", ".join(f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics)
+    return [f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics]
 
 
 def action_bounds(envs, device) -> tuple[torch.Tensor, torch.Tensor]:
     space = envs.single_action_space
     return torch.as_tensor(space.low, device=device), torch.as_tensor(space.high, device=device)
+
+
+def how_to_render(on_gpu: bool) -> str:
+    if on_gpu:
+        return "NVIDIA_DRIVER_CAPABILITIES=all in a container"
+    return "apt install mesa-vulkan-drivers, 23.1 or newer, which Debian 12 has in its backports"
 
 
 def prepare_rendering(args: Args) -> None:
@@ -1131,12 +1155,7 @@ def prepare_rendering(args: Args) -> None:
         args.capture_video, args.save_train_video_freq = False, None
     elif RENDER_DEVICE is None or (on_gpu and not RENDER_DEVICE.is_cuda()):
         if args.capture_video or args.save_train_video_freq:
-            how = (
-                "NVIDIA_DRIVER_CAPABILITIES=all in a container"
-                if on_gpu
-                else "apt install mesa-vulkan-drivers (>= 23.1)"
-            )
-            print(f"no videos: there is no Vulkan device to render them (to get one: {how})")
+            print(f"no videos: there is no Vulkan device to render them (to get one: {how_to_render(on_gpu)})")
         args.capture_video, args.save_train_video_freq = False, None
 
 
@@ -1147,12 +1166,11 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     torch.set_num_threads(1)
     envs = make_envs(args, run_dir / "test_videos", evaluation=True)
     closing.callback(envs.close)
-    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0], args).to(device)
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
     load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
     num_episodes, num_steps = evaluation_size(envs, args)
     episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
     envs.close()  # which completes the videos
-    merge_recorded(run_dir / "test_videos")
     videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
 
     results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
@@ -1189,10 +1207,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     envs = make_envs(args, run_dir / "train_videos")
     closing.callback(envs.close)
-    obs_dim, act_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    obs_space, action_space = envs.single_observation_space, envs.single_action_space
     low, high = action_bounds(envs, device)
 
-    agent = Agent(obs_dim, act_dim, args).to(device)
+    agent = Agent(obs_space, action_space, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
     critic = [p for name, p in agent.named_parameters() if name.startswith("critic")]
     actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
@@ -1281,8 +1299,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     # --- rollout storage ---
     shape = (args.num_steps, args.num_envs)
-    obs = torch.zeros(*shape, obs_dim, device=device)
-    actions = torch.zeros(*shape, act_dim, device=device)
+    obs = torch.zeros(*shape, *obs_space.shape, device=device)
+    actions = torch.zeros(*shape, *action_space.shape, device=device)
     logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
 
     # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
@@ -1309,13 +1327,11 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
         # --- checkpoint: here a resumed run goes on, and to here an update that goes wrong is taken back ---
-        snapshot = copy.deepcopy(
-            {
-                "agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "iteration": iteration,
-                "global_step": global_step, "best_score": best_score, "metrics_size": metrics_file.tell(),
-                "wandb_id": wandb_id, "args": given, "versions": about["versions"],
-            }
-        )  # fmt: skip
+        snapshot = {
+            "agent": copy.deepcopy(agent.state_dict()), "optimizer": copy.deepcopy(optimizer.state_dict()),
+            "iteration": iteration, "global_step": global_step, "best_score": best_score,
+            "metrics_size": metrics_file.tell(), "wandb_id": wandb_id, "args": given, "versions": about["versions"],
+        }  # fmt: skip
         minutes = (time.monotonic() - last_saved) / 60
         if iteration % args.checkpoint_freq == 0 or (minutes > args.checkpoint_minutes and not args.exact_resume):
             save("last.pt", snapshot)
@@ -1332,7 +1348,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             name_videos(run_dir / "videos", f"step_{global_step:09d}")
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
             best = score > best_score and all(map(math.isfinite, score))
-            bar.write(f"step {global_step:>9,}  evaluation: {summary(metrics)}" + "  (best)" * best)
+            bar.write(f"step {global_step:>9,}  evaluation: {', '.join(summary(metrics))}" + "  (best)" * best)
             if best and save("best.pt", snapshot | {"best_score": score}):
                 best_score = score
             attempt("learning_curve.png", plot_learning_curve, run_dir)
@@ -1347,7 +1363,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
             seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
             next_obs, _ = envs.reset(seed=(seeds // 2 + 2**31).tolist(), options=rebuild)  # evaluation's lie below 2^31
-            next_obs = next_obs.to(device)
+            next_obs = to_device(next_obs, device)
         episode_sums, num_episodes = {}, torch.zeros((), device=device)
         for step in range(args.num_steps):
             obs[step] = next_obs
@@ -1355,13 +1371,13 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                 actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
             action = actions[step].clamp(low, high).nan_to_num()  # the simulator takes no NaN; the check below does
             next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
-            next_obs, terminated, truncated = next_obs.to(device), terminated.to(device), truncated.to(device)
+            next_obs, terminated, truncated = to_device(next_obs, device), terminated.to(device), truncated.to(device)
             done = terminated | truncated
             rewards[step] = reward.to(device) * args.reward_scale
             dones[step] = done
             if "final_observation" in infos:  # next_obs is the first of a new episode where done
                 with torch.no_grad():
-                    final_value = agent.get_value(infos["final_observation"].to(device))
+                    final_value = agent.get_value(to_device(infos["final_observation"], device))
                 next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
                 num_episodes += done.sum()
                 for key, value in infos["final_info"]["episode"].items():
@@ -1383,10 +1399,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             env_idx = broken.any(0).nonzero().flatten()
             problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
             # scenes that are rebuilt now and then are so all at once
-            next_obs, _ = envs.reset(
-                options=None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
-            )
-            next_obs = next_obs.to(device)
+            some = None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
+            next_obs = to_device(envs.reset(options=some)[0], device)
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
@@ -1445,7 +1459,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             bar.write(f"iteration {iteration + 1}: {problem}: no update")
             if failures["update"] == MAX_FAILURES:
                 raise RunError(f"no update in {MAX_FAILURES} iterations in a row: {problem}")
-        status = f"{metrics['sps']:,.0f} steps/s, {summary(metrics)}"
+        status = ", ".join([f"{metrics['sps']:,.0f} steps/s", *summary(metrics)])
         bar.set_postfix_str(status, refresh=False)
         bar.update(args.batch_size)
         if bar.disable and time.monotonic() - last_line > 10:  # no terminal
@@ -1455,7 +1469,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     if not finished:
         return 128 + stopped_by
     closing.close()
-    merge_recorded(run_dir / "videos")
     print(f"learning curve, videos and metrics are in {run_dir}")
     if args.save_model:
         print("to evaluate the best policy on other episodes:")
@@ -1470,7 +1483,7 @@ def main(argv: list[str]) -> int:
         with contextlib.ExitStack() as closing:
             code = (evaluate_checkpoint if args.evaluate else train)(args, closing)
     except RunError as error:
-        print(f"ppo.py: {error}", file=sys.stderr)
+        print(f"{SCRIPT.name}: {error}", file=sys.stderr)
         code = 1
     except KeyboardInterrupt:  # before the loop, which has a better way to stop
         code = 130

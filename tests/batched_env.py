@@ -1,9 +1,11 @@
-"""A small torch-native batched environment with the interface of a GPU-simulated ManiSkill task."""
+"""Small torch-native batched environments with the interface of a GPU-simulated ManiSkill task."""
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector.utils import batch_space
 
+import ppo_rgb
 from ppo import ManiSkillVectorEnv  # ppo before mani_skill, which it prepares for machines without Vulkan
 
 
@@ -19,8 +21,8 @@ class BatchedReach(gym.Env):
         self.num_envs, self.device, self.metadata = num_envs, torch.device(device), {}
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
         self.single_action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self.state = torch.zeros(num_envs, 4, device=self.device)
         self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
 
@@ -28,6 +30,9 @@ class BatchedReach(gym.Env):
         distance = (self.state[:, :2] - self.state[:, 2:]).norm(dim=1)
         success, fail = distance < 0.1, self.state[:, :2].abs().amax(1) > 2
         return dict(success=success, fail=fail, elapsed_steps=self.elapsed_steps), distance
+
+    def observe(self):
+        return self.state.clone()
 
     def reset(self, *, seed=None, options=None):
         env_idx = (options or {}).get("env_idx", torch.arange(self.num_envs, device=self.device))
@@ -38,7 +43,7 @@ class BatchedReach(gym.Env):
             fresh = torch.stack(draws).to(self.device)
         self.state[env_idx] = 2 * fresh - 1
         self.elapsed_steps[env_idx] = 0
-        return self.state.clone(), self.info()[0]
+        return self.observe(), self.info()[0]
 
     def step(self, actions):
         assert (actions.abs() <= 1).all(), "actions come clipped to the action space"
@@ -46,12 +51,53 @@ class BatchedReach(gym.Env):
         self.elapsed_steps += 1
         info, distance = self.info()
         truncated = self.elapsed_steps >= self.max_episode_steps
-        return self.state.clone(), 1 - torch.tanh(distance), info["success"] | info["fail"], truncated, info
+        return self.observe(), 1 - torch.tanh(distance), info["success"] | info["fail"], truncated, info
+
+
+class BatchedReachImages(BatchedReach):
+    """The same seen by two cameras, in ManiSkill's raw form: the goal on the images alone."""
+
+    size = 36
+
+    def __init__(self, num_envs, device):
+        super().__init__(num_envs, device)
+        self.update_obs_space(self.observe())
+
+    def update_obs_space(self, obs):
+        self._init_raw_obs = obs
+        if "sensor_data" not in obs:
+            spaces = {
+                k: gym.spaces.Box(-np.inf, np.inf, v.shape[1:], np.float32)
+                if v.is_floating_point()
+                else gym.spaces.Box(0, torch.iinfo(v.dtype).max, v.shape[1:], str(v.dtype).removeprefix("torch."))
+                for k, v in obs.items()
+            }
+            self.single_observation_space = gym.spaces.Dict(spaces)
+            self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def observe(self):
+        pixels = torch.linspace(-2, 2, self.size, device=self.device)
+        disc = lambda xy: (
+            ((pixels[None, :, None] - xy[:, 1, None, None]) ** 2 + (pixels[None, None] - xy[:, 0, None, None]) ** 2)
+            < 0.05
+        )
+        position, goal = disc(self.state[:, :2]), disc(self.state[:, 2:])
+        ids = (position + 2 * goal.short())[..., None].short()
+        rgb = torch.stack([position, goal, torch.zeros_like(goal)], dim=-1).to(torch.uint8) * 255
+        depth = 2000 - 100 * ids
+        front = dict(rgb=rgb, depth=depth, segmentation=ids)
+        back = {k: v.flip(2) for k, v in front.items()}
+        agent = dict(position=self.state[:, :2].clone())
+        return dict(agent=agent, extra={}, sensor_param={}, sensor_data=dict(front=front, back=back))
 
 
 def make_envs(args, record_dir, evaluation=False, device="cpu"):
-    """Stands in for ppo.make_envs."""
-    env = BatchedReach(args.num_eval_envs if evaluation else args.num_envs, device)
+    """Stands in for make_envs of both scripts."""
+    num_envs = args.num_eval_envs if evaluation else args.num_envs
+    if args.obs_mode == "state":
+        env = BatchedReach(num_envs, device)
+    else:
+        env = ppo_rgb.ImageObservations(BatchedReachImages(num_envs, device), args)
     ignore_terminations = not (args.eval_partial_reset if evaluation else args.partial_reset)
     return ManiSkillVectorEnv(
         env, auto_reset=not evaluation, ignore_terminations=ignore_terminations, record_metrics=True

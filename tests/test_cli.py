@@ -18,22 +18,6 @@ TINY = ("--num_envs", 2, "--num_eval_envs", 1, "--num_eval_episodes", 2, "--num_
         "--num_minibatches", 2, "--no-cuda", "--exp-name", "tiny")  # fmt: skip
 
 
-def inline_metadata(script):
-    """The PEP 723 block of a script, without its comment signs."""
-    block = re.search(r"^# /// script\n((?:#.*\n)+?)# ///$", script.read_text(), re.M).group(1)
-    return "".join(line[2:] if line.startswith("# ") else line[1:] for line in block.splitlines(keepends=True))
-
-
-def test_inline_metadata_equals_pyproject():
-    try:
-        import tomllib
-    except ImportError:
-        import tomli as tomllib
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    script = tomllib.loads(inline_metadata(ROOT / "ppo.py"))
-    assert script == {k: project[k] for k in ("requires-python", "dependencies")}
-
-
 def test_run_folder(trained):
     folder, process = trained
     rows = read_metrics(folder)
@@ -256,14 +240,19 @@ def test_videos_and_trajectories(tmp_path):
     assert list((run / "train_videos").glob("*.mp4"))
     images = frames(run / "videos" / videos[0])
     assert 8 <= len(images) <= 10 and images.std() > 10, "a filmed scene is not of one colour"
-    # ManiSkill's own tool replays what was recorded, to the same states
+    # ManiSkill's own tools join and replay what was recorded, to the same states
     files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
-    assert files == ["trajectory.h5", "trajectory.json"]
-    episodes = json.loads((run / "videos/trajectory.json").read_text())["episodes"]
+    assert files == [f"trajectory_{i}.{suffix}" for i in range(2) for suffix in ("h5", "json")]
+    merge = subprocess.run(
+        [sys.executable, "-m", "mani_skill.trajectory.merge_trajectory", "-i", run / "videos", "-o", run / "all.h5",
+         "-p", "trajectory_*.h5"], capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert merge.returncode == 0, merge.stderr[-2000:]
+    episodes = json.loads((run / "all.json").read_text())["episodes"]
     assert len(episodes) == 6 and {e["elapsed_steps"] for e in episodes} == {8}
     assert sorted(e["episode_seed"] for e in episodes) == [0, 0, 0, 1, 1, 1]
     replay = subprocess.run(
-        [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", run / "videos/trajectory.h5",
+        [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", run / "all.h5",
          "--sim-backend", "physx_cpu", "--save-traj", "--allow-failure", "--count", "2"],
         capture_output=True, text=True, stdin=subprocess.DEVNULL, cwd=tmp_path,
     )  # fmt: skip

@@ -1,0 +1,1692 @@
+# /// script
+# requires-python = ">=3.10,<3.13"
+# dependencies = [
+#     "mani-skill>=3.0.1,<3.1",
+#     "sapien>=3.0.3,<3.1",
+#     "torch>=2.6,<3",
+#     "gymnasium>=1.0,<2",
+#     "tensorboard>=2.16,<3",
+#     "tyro>=0.9,<2",
+#     "matplotlib>=3.8,<4",
+#     "psutil>=5.9,<8",
+# ]
+# ///
+"""PPO for ManiSkill from images, in one file.
+
+Train     python ppo_rgb.py --env_id PushCube-v1
+Resume    python ppo_rgb.py --resume runs/NAME
+Evaluate  python ppo_rgb.py --evaluate --checkpoint runs/NAME/best.pt
+Watch     runs/NAME/videos/*.mp4, runs/NAME/learning_curve.png, tensorboard --logdir runs
+Help      python ppo_rgb.py --help
+
+The same command runs on a GPU and, rendering in software, on a CPU. `uv run ppo_rgb.py` installs what it needs.
+To make it yours: the network is `Encoder` and `Agent`, the numbers are `Args`, the algorithm is `train`, top to bottom.
+"""
+
+import contextlib
+import copy
+import difflib
+import gc
+import importlib.metadata
+import importlib.util
+import inspect
+import io
+import json
+import math
+import os
+import platform
+import random
+import re
+import shlex
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal, NoReturn, Optional
+from unittest.mock import MagicMock, patch
+
+# Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
+warnings.filterwarnings(
+    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision"
+)
+
+import gymnasium as gym
+import numpy as np
+import psutil
+import sapien
+import torch
+import torch.multiprocessing as mp
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.distributions import Normal
+from tqdm import tqdm
+
+
+def find_render_device() -> Optional[sapien.Device]:
+    """The device SAPIEN can render with (a CUDA GPU, else any Vulkan device, software ones included), or None."""
+    for name in ("cuda", "pci:0", "cpu"):
+        try:
+            device = sapien.Device(name)
+        except RuntimeError:
+            continue
+        if device.can_render():
+            return device
+    return None
+
+
+SCRIPT = Path(__file__)
+RENDER_DEVICE = find_render_device()
+STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
+MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
+
+import mani_skill.envs  # registers the tasks
+import mani_skill.envs.sapien_env as sapien_env
+from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
+from mani_skill.utils.wrappers.record import RecordEpisode
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+parse_backends = sapien_env.parse_sim_and_render_backend
+
+
+def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
+    """ManiSkill's render_backend has no name for a Vulkan device without CUDA: put it in where CUDA is not found."""
+    backend = parse_backends(sim_backend, render_backend)
+    if RENDER_DEVICE and backend.render_device and not backend.render_device.can_render():
+        backend.render_device, backend.render_backend = RENDER_DEVICE, "sapien_cpu"
+    return backend
+
+
+sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
+
+# what concerns no user: the render device is replaced above, robots are as they are
+NOISE = "Requested to use render device|mani_skill is not installed with git|"
+NOISE += "Currently ManiSkill does not support loading plane|No initial pose set for"
+mani_skill.logger.addFilter(lambda record: not re.match(NOISE, record.getMessage()))
+
+
+@dataclass
+class Args:
+    # --- experiment ---
+    exp_name: Optional[str] = None
+    """name of the run, whose files go to runs/<exp_name> (None: <env_id>__ppo__<seed>__<time>)"""
+    seed: int = 1
+    """seed of the weights, the actions and the training episodes"""
+    torch_deterministic: bool = True
+    """ask cuDNN for deterministic algorithms"""
+    cuda: bool = True
+    """use a CUDA GPU where there is one; --no-cuda keeps simulation and learning on the CPU"""
+    track: bool = False
+    """log to Weights & Biases as well (needs: pip install wandb)"""
+    wandb_project_name: str = "ManiSkill"
+    """Weights & Biases project"""
+    wandb_entity: Optional[str] = None
+    """Weights & Biases entity (team)"""
+    wandb_group: str = "PPO"
+    """Weights & Biases group"""
+
+    # --- environment ---
+    env_id: str = "PushCube-v1"
+    """the task: any registered ManiSkill task, or module:EnvId for one of your own"""
+    obs_mode: str = "rgb"
+    """textures that the cameras see, joined by +: rgb, depth, segmentation, position, normal, albedo"""
+    include_state: bool = True
+    """see the robot's own state too, and what else the task shows beside images; --no-include_state: images alone"""
+    frame_stack: int = 1
+    """see the last so many observations at once"""
+    camera_width: Optional[int] = None
+    """width of the images in pixels (None: the task's own)"""
+    camera_height: Optional[int] = None
+    """height of the images in pixels (None: the task's own)"""
+    control_mode: Optional[str] = "pd_joint_delta_pos"
+    """controller of the robot (None: the robot's own default)"""
+    robot_uids: Optional[str] = None
+    """robot (None: the task's own)"""
+    reward_mode: Optional[Literal["normalized_dense", "dense", "sparse", "none"]] = None
+    """what is learned from (None: the first of these that the task has)"""
+    sim_backend: str = "auto"
+    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
+    render_backend: str = "gpu"
+    """where images are rendered: gpu (gpu:1) or cpu; what is not there is replaced by what is"""
+    num_envs: int = 256
+    """parallel training environments (on a CPU: 8 a core)"""
+    num_eval_envs: int = 16
+    """parallel evaluation environments (on a CPU: 4 a core)"""
+    partial_reset: bool = True
+    """end a training episode at success or failure; --no-partial_reset: at the time limit only"""
+    eval_partial_reset: bool = False
+    """end an evaluation episode at success or failure"""
+    reconfiguration_freq: Optional[int] = None
+    """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
+    eval_reconfiguration_freq: Optional[int] = None
+    """rebuild evaluation scenes every so many resets; 1 suits tasks that vary their objects"""
+    render_mode: Literal["rgb_array", "sensors", "all"] = "all"
+    """what videos show: rgb_array (the scene), sensors (what the policy sees) or all (both)"""
+    shader: Optional[Literal["minimal", "default", "rt-fast", "rt-med", "rt"]] = None
+    """shader pack of the images (None: minimal, or default for normal and albedo); rt: CPU simulation only"""
+    env_kwargs: str = "{}"
+    """further arguments of gym.make as JSON, such as '{"sensor_configs": {"fov": 0.6}}'"""
+
+    # --- PPO ---
+    total_timesteps: int = 10_000_000
+    """environment steps in all (on a CPU: 250,000)"""
+    learning_rate: float = 3e-4
+    """Adam's learning rate (on a CPU: 1e-3)"""
+    critic_learning_rate: Optional[float] = None
+    """learning rate of the critic's layers (None: learning_rate)"""
+    num_steps: Optional[int] = None
+    """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
+    anneal_lr: bool = False
+    """let the learning rate fall linearly to zero over the run (on a CPU: yes)"""
+    gamma: float = 0.8
+    """discount factor"""
+    gae_lambda: float = 0.9
+    """lambda of generalised advantage estimation"""
+    num_minibatches: int = 32
+    """minibatches per epoch (on a CPU: 8); where they do not divide the batch, a random remainder sits out"""
+    update_epochs: int = 4
+    """passes over the batch per iteration (on a CPU: 8)"""
+    norm_adv: bool = True
+    """normalise the advantages of each minibatch"""
+    clip_coef: float = 0.2
+    """clipping range of the probability ratio"""
+    clip_vloss: bool = False
+    """clip the value's change by clip_coef too"""
+    ent_coef: float = 0.0
+    """weight of the entropy bonus"""
+    vf_coef: float = 0.5
+    """weight of the value loss"""
+    max_grad_norm: float = 0.5
+    """largest norm of the gradient"""
+    target_kl: Optional[float] = 0.1
+    """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never)"""
+    reward_scale: float = 1.0
+    """factor on the rewards that are learned from; logged returns are without it"""
+    bootstrap_at_done: Literal["always", "truncated", "never"] = "always"
+    """episode ends at which the value of the final observation still counts"""
+    finite_horizon_gae: bool = False
+    """lambda-weighted mean over the n-step returns that exist, instead of the infinite sum"""
+    encoder: Literal["nature", "impala"] = "nature"
+    """network on the images: NatureCNN, or the residual one of IMPALA, which is slower and sees finer things"""
+    random_shift: int = 0
+    """in updates, shift each image by up to so many pixels at random (DrQ takes 4)"""
+    channels_last: bool = True
+    """keep the convolutions' tensors in channels-last order"""
+    amp: bool = False
+    """run the encoder in bfloat16 (automatic mixed precision)"""
+    norm_obs: bool = False
+    """normalise the state by its running mean and variance (on a CPU: yes)"""
+    logstd_init: float = -0.5
+    """initial logarithm of the policy's standard deviation"""
+
+    # --- evaluation and checkpoints ---
+    eval_freq: int = 25
+    """evaluate every so many iterations (on a CPU: 50), and always before the first and after the last; 0: only then"""
+    num_eval_episodes: int = 64
+    """episodes of an evaluation (on a CPU: 16)"""
+    num_eval_steps: Optional[int] = None
+    """instead of num_eval_episodes: steps in each evaluation environment, as many episodes as fit, at least one"""
+    eval_seed: int = 0
+    """evaluation episode k starts from seed eval_seed + k, below 2^31; training's seeds lie above"""
+    stop_at_success: Optional[float] = None
+    """end the run once an evaluation's success_once reaches this rate"""
+    evaluate: bool = False
+    """only evaluate --checkpoint, which brings its task, network and flags along"""
+    checkpoint: Optional[str] = None
+    """checkpoint to evaluate, or whose weights training starts from"""
+    save_model: bool = True
+    """write best.pt (the best evaluation so far) and last.pt"""
+    save_freq: Optional[int] = None
+    """keep a numbered checkpoint every so many iterations too"""
+    checkpoint_freq: int = 10
+    """write last.pt every so many iterations"""
+    checkpoint_minutes: float = 5
+    """write last.pt also when the one before is so old (not with --exact_resume)"""
+    resume: Optional[str] = None
+    """run folder, or checkpoint in one, to continue in place, with the run's own flags; those of the machine, logging,
+    videos and checkpoints, eval_freq, stop_at_success and total_timesteps may be given anew"""
+    exact_resume: bool = False
+    """start new episodes in new scenes at every checkpoint_freq-th iteration and write last.pt there only: a run on CPU
+    simulation that was stopped and resumed is then bit-identical to one that was not (a GPU's is not deterministic)"""
+    capture_video: bool = True
+    """film the first episodes of each evaluation, where there is a renderer"""
+    save_train_video_freq: Optional[int] = None
+    """film training every so many iterations (on a GPU all environments, as tiles: keep num_envs small)"""
+    save_trajectory: bool = False
+    """write evaluation episodes as ManiSkill trajectories, beside the videos: one file, or on a CPU one an environment
+    (python -m mani_skill.trajectory.merge_trajectory joins them)"""
+
+    # --- runtime ---
+    compile: bool = False
+    """accepted, has no effect yet"""
+    cudagraphs: bool = False
+    """accepted, has no effect yet"""
+
+    @property
+    def batch_size(self) -> int:
+        return self.num_envs * self.num_steps
+
+    @property
+    def minibatch_size(self) -> int:
+        return self.batch_size // self.num_minibatches
+
+    @property
+    def num_iterations(self) -> int:
+        return self.total_timesteps // self.batch_size
+
+
+CPU_DEFAULTS = dict(
+    total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
+    eval_freq=50, num_eval_episodes=16,
+)  # fmt: skip
+TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
+
+# --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
+# of the network from the checkpoint; a resumed run may be given only some anew
+OF_THE_MACHINE = {"cuda", "sim_backend", "render_backend", "num_eval_envs", "capture_video", "save_trajectory", "track"}
+OF_THE_NETWORK = (
+    "norm_obs", "encoder", "obs_mode", "include_state", "frame_stack", "camera_width", "camera_height", "shader",
+)  # fmt: skip
+MAY_CHANGE = OF_THE_MACHINE | {
+    "total_timesteps", "stop_at_success", "eval_freq", "save_model", "save_freq", "checkpoint_freq",
+    "checkpoint_minutes", "save_train_video_freq", "render_mode", "channels_last", "wandb_project_name", "wandb_entity",
+    "wandb_group", "torch_deterministic", "compile", "cudagraphs", "resume",
+}  # fmt: skip
+
+
+def fail(message: str) -> NoReturn:
+    """Refuse bad input: one line, exit code 2."""
+    print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+class RunError(RuntimeError):
+    """What ends a run through no fault of this script: told without a traceback of it."""
+
+
+def num_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def parse_args(argv: list[str]) -> Args:
+    """Command line to Args. Defaults are those of the run to resume or to evaluate, or of the simulation backend: on
+    a GPU steps are cheap and hundreds of environments run at once, on a CPU each step is learned from more often."""
+
+    def parse(argv, default):
+        errors = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(errors):
+                args = tyro.cli(Args, args=argv, default=default)
+        except SystemExit as error:
+            if error.code == 0:  # --help
+                raise
+            message = errors.getvalue().partition("\n")[2].partition("│ ──")[0]  # of a box with a title and a footer
+            fail(re.sub("[│╰╯─]+", " ", message) + " (see --help)")
+        return replace(args, sim_backend=resolve_backend(args))
+
+    args = parse([arg for arg in argv if arg not in ("-h", "--help")], Args())
+    default, stored, kept = Args(), {}, ()
+    if args.sim_backend == "physx_cpu":
+        default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores(), num_eval_envs=4 * num_cores())
+    if args.resume is not None:
+        if args.evaluate or args.checkpoint:
+            fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
+        stored = load_checkpoint(find_checkpoint(args.resume))["args"]
+        kept = stored.keys()
+    elif args.evaluate or args.checkpoint is not None:
+        stored = load_checkpoint(args.checkpoint)["args"]
+        of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
+        kept = stored.keys() - of_this_evaluation if args.evaluate else OF_THE_NETWORK
+    args = parse(argv, replace(default, **{k: stored[k] for k in kept if hasattr(default, k)}))
+    if args.resume is not None:
+        for k in kept - MAY_CHANGE:
+            if hasattr(args, k) and getattr(args, k) != stored[k]:
+                fail(f"--resume: the run has --{k} {stored[k]}, not {getattr(args, k)}; start a new one to change that")
+        args.resume = str(find_checkpoint(args.resume))
+    if args.num_steps is None:
+        args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+    if args.exp_name is None:
+        args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
+    return args
+
+
+def find_checkpoint(path: str) -> Path:
+    """The checkpoint that --resume means: the file itself, or a run folder's last.pt."""
+    return Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
+
+
+def find_run_dir(args: Args) -> Path:
+    checkpoint = args.resume or (args.checkpoint if args.evaluate else None)
+    return Path(checkpoint).parent if checkpoint else Path("runs") / args.exp_name
+
+
+def resolve_backend(args: Args) -> str:
+    if args.sim_backend == "auto":
+        return "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
+    return {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}.get(args.sim_backend, args.sim_backend)
+
+
+# ----- Environments ---------------------------------------------------------------------------------------------------
+
+
+def find_task(env_id: str):
+    """The registration of a task; KeyError or ImportError if there is none."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return REGISTERED_ENVS[name]
+
+
+def default_reward_mode(task) -> str:
+    """The most telling reward that a task offers; some name "none" first."""
+    return next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in task.SUPPORTED_REWARD_MODES)
+
+
+class ImageObservations(FlattenRGBDObservationWrapper):
+    """Observations as a dict: if included "state", float32 (num_envs, state_dim), and each texture of `obs_mode`, all
+    cameras together as channels: (num_envs, height, width, channels), in the dtype in which it was rendered (uint8
+    colours, int16 millimetres and ids). ManiSkill's wrapper knows colours and depth; this one adds the other textures,
+    the last `frame_stack` frames as further channels, where ManiSkill's knows no partial resets, and the view."""
+
+    def __init__(self, env: gym.Env, args: Args):
+        textures = args.obs_mode.split("+")
+        self.others = [k for k in textures if k not in ("rgb", "depth")]
+        self.num_frames, self.frames = args.frame_stack, {}
+        super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
+
+    def observation(self, observation: dict, new_episodes=None) -> dict:
+        cameras = observation["sensor_data"].values()
+        latest = super().observation(observation)
+        latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
+        if "segmentation" in latest:
+            latest["segmentation"] = latest["segmentation"].short()  # of which some shaders make 64 bits
+        if self.num_frames == 1:
+            return latest
+        for k, frame in latest.items():
+            filled = torch.cat([frame] * self.num_frames, dim=-1)  # an episode begins with its first frame repeated
+            if new_episodes is not None and k in self.frames:
+                self.frames[k] = self.frames[k].index_copy(0, new_episodes, filled[new_episodes])
+            elif k in self.frames:
+                self.frames[k] = torch.cat([self.frames[k][..., frame.shape[-1] :], frame], dim=-1)
+            else:
+                self.frames[k] = filled
+        return dict(self.frames)
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = self.env.reset(seed=seed, options=options)
+        everyone = torch.arange(self.base_env.num_envs, device=self.base_env.device)
+        return self.observation(obs, (options or {}).get("env_idx", everyone)), info
+
+    def render(self) -> torch.Tensor:
+        """The scene, and in a column beside it what the policy sees: uint8 (num_envs, height, width, 3)."""
+        if self.base_env.render_mode != "all":
+            return self.env.render()
+        scene = self.base_env.render_rgb_array()
+        views = [view for camera in self.base_env.get_sensor_images().values() for view in camera.values()]
+        height = scene.shape[1] // max(2, len(views))
+        views = [F.interpolate(v.permute(0, 3, 1, 2), size=(height, height * v.shape[2] // v.shape[1])) for v in views]
+        column = torch.cat([F.pad(v, (0, max(x.shape[3] for x in views) - v.shape[3])) for v in views], dim=2)
+        column = F.pad(column, (0, 0, 0, scene.shape[1] - column.shape[2]))
+        return torch.cat([scene, column.permute(0, 2, 3, 1)], dim=2)
+
+
+def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
+    """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
+    `index` tells it from the others and only the first is filmed."""
+    video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
+    trajectory = evaluation and args.save_trajectory
+    further = json.loads(args.env_kwargs)
+    sensors = dict(width=args.camera_width, height=args.camera_height, shader_pack=args.shader)
+    kwargs = dict(
+        num_envs=num_envs,
+        obs_mode=args.obs_mode,
+        control_mode=args.control_mode,
+        robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
+        reward_mode=args.reward_mode or default_reward_mode(find_task(args.env_id).cls),
+        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
+        sim_backend=args.sim_backend,
+        render_backend=args.render_backend,
+        render_mode=args.render_mode if video else None,
+        sensor_configs={k: v for k, v in sensors.items() if v is not None} | further.pop("sensor_configs", {}),
+    )
+    env = gym.make(args.env_id, **{k: v for k, v in kwargs.items() if v is not None}, **further)
+    env = ImageObservations(env, args)
+    if isinstance(env.action_space, gym.spaces.Dict):
+        env = FlattenActionSpaceWrapper(env)
+    if video or trajectory:
+        base_env, rounds_filmed = env.unwrapped, 4 if args.evaluate else 1
+
+        def is_filmed(step):
+            if evaluation:  # its first episodes, which the seeds tell
+                return base_env._episode_seed[0] < args.eval_seed + rounds_filmed * args.num_eval_envs
+            return step // args.num_steps % args.save_train_video_freq == 0
+
+        env = RecordEpisode(
+            env,
+            output_dir=str(record_dir),
+            save_video=video,
+            save_video_trigger=is_filmed,
+            save_on_reset=evaluation,
+            avoid_overwriting_video=not evaluation,
+            max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
+            video_fps=base_env.control_freq,
+            save_trajectory=trajectory,
+            trajectory_name=f"trajectory_{index}",
+            source_type="rl",
+            source_desc="PPO",
+        )
+    return env
+
+
+def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
+    """Number of evaluation episodes, and of steps in each: the task's time limit, or num_eval_steps if it has none."""
+    limit = find_max_episode_steps_value(env)
+    if limit is None or args.num_eval_steps is None:
+        return args.num_eval_episodes, limit or args.num_eval_steps or 1000
+    return args.num_eval_envs * max(1, args.num_eval_steps // limit), limit
+
+
+def seed_all(*numbers: int) -> None:
+    """Seed every random generator of this process."""
+    seed = int(np.random.SeedSequence(numbers).generate_state(1)[0])
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+
+
+def stream_seed(seed: int) -> int:
+    """Seed of the random stream from which episodes without a seed follow one with `seed`. ManiSkill draws that one
+    from `seed` itself, so the others need a different one; like all seeds of training it is at least 2^31."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0]) | 2**31
+
+
+def as_dict(obs) -> dict:
+    """Observations by name, also where there is one only."""
+    return obs if isinstance(obs, (dict, gym.spaces.Dict)) else {"state": obs}
+
+
+def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
+    """Body of a worker process: build the environments `indices`, then answer each message with one message.
+
+    Each environment has its own stream of torch random numbers, so that its episodes depend on neither its neighbours
+    nor the number of workers."""
+    torch.set_num_threads(1)
+    torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
+
+    envs, streams = [], []
+
+    def in_own_stream(i, function, *args, **kwargs):
+        torch.set_rng_state(streams[i])
+        result = function(*args, **kwargs)
+        streams[i] = torch.get_rng_state()
+        return result
+
+    def batch(infos):
+        return {
+            k: (torch.cat if v.ndim else torch.stack)([info[k] for info in infos]).numpy()
+            if isinstance(v, torch.Tensor)
+            else v
+            for k, v in (infos[0].items() if infos else ())
+        }
+
+    def reset(rows, seeds=None, options=None):
+        infos = []
+        for i in rows:
+            seed = None if seeds is None else seeds[i]
+            if seed is not None:
+                streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
+                np.random.seed(seed)
+                random.seed(seed)
+            first_obs, info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
+            for k, v in as_dict(first_obs).items():
+                reset_obs[k][i] = v[0]
+            infos.append(info)
+        return batch(infos)
+
+    try:
+        for index in indices:
+            torch.manual_seed(index)
+            np.random.seed(index)
+            envs.append(make_env(index))
+            streams.append(torch.get_rng_state())
+            conn.send("built")
+        spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
+        conn.send((spaces, find_max_episode_steps_value(envs[0])))
+        share = slice(indices[0], indices[-1] + 1)
+        obs, reset_obs, *others = conn.recv()
+        obs, reset_obs = [{k: v[share] for k, v in buffers.items()} for buffers in (obs, reset_obs)]
+        rewards, terminated, truncated, actions = [buffer[share] for buffer in others]
+        while True:
+            try:
+                command, *arguments = conn.recv()
+            except EOFError:  # the main process closed the pipe
+                break
+            if command == "step":
+                results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
+                next_obs, *tensors, infos = zip(*results)
+                for k, buffer in obs.items():
+                    torch.cat([as_dict(x)[k] for x in next_obs], out=buffer)
+                for buffer, rows in zip((rewards, terminated, truncated), tensors):
+                    torch.cat(rows, out=buffer)
+                infos = batch(infos)  # before the resets, which write into the same tensors
+                ended = truncated if ignore_terminations else terminated | truncated
+                conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
+            else:
+                conn.send(reset(*arguments))
+    except ConnectionError:
+        pass  # it did so while it was to be answered, or is gone
+    except BaseException:
+        with contextlib.suppress(ConnectionError):
+            conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
+    for env in envs:
+        env.close()
+
+
+def to_device(obs, device):
+    return {k: v.to(device) for k, v in obs.items()} if isinstance(obs, dict) else obs.to(device)
+
+
+class CPUVectorEnv(gym.Env):
+    """`num_envs` CPU-simulated environments as one batched environment, to be wrapped by ManiSkillVectorEnv.
+
+    Worker processes, one a core, each step their share of the environments one after the other. Observations,
+    rewards, flags and actions pass through shared memory, and a step costs one message to each worker and one back:
+    with `auto_reset` a worker also resets the episodes that ended, so that the partial reset which ManiSkillVectorEnv
+    asks for next finds its work done.
+
+    Args:
+        make_env: picklable function from an index in [0, num_envs) to a ManiSkill environment with num_envs=1.
+        ignore_terminations: as given to ManiSkillVectorEnv: whether an episode ends at its time limit only.
+        description: what a progress bar calls the environments while they are built.
+
+    Raises:
+        RunError: with the traceback or the exit code of a worker that failed.
+    """
+
+    device = torch.device("cpu")
+    reconfiguration_freq = 0  # as a batch; each environment is a scene of its own and keeps its own frequency
+
+    def __init__(self, make_env, num_envs, num_workers, auto_reset=True, ignore_terminations=False, description=""):
+        self.num_envs, self.metadata = num_envs, {}
+        context = mp.get_context("spawn")
+        self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
+        self.conns, self.workers = [], []
+        # inherited by the workers: to stop is for the main process alone to decide, whom it then tells
+        handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOP_SIGNALS}
+        for share in self.shares:
+            conn, worker_conn = context.Pipe()
+            worker = context.Process(
+                target=cpu_worker, args=(worker_conn, make_env, share, auto_reset, ignore_terminations), daemon=True
+            )
+            worker.start()
+            worker_conn.close()  # so that a dead worker reads as the end of its pipe
+            self.conns.append(conn)
+            self.workers.append(worker)
+        for s, handler in handlers.items():
+            signal.signal(s, handler)
+        try:
+            with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
+                for i in range(len(self.shares[0])):
+                    for w, share in enumerate(self.shares):
+                        if i < len(share):
+                            self._receive(w)
+                            bar.update()
+            spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+        except BaseException:
+            self.close()
+            raise
+        self.single_observation_space, self.single_action_space = spaces
+        self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
+        self.obs, self.reset_obs = [
+            {k: torch.from_numpy(np.zeros((num_envs, *s.shape), s.dtype)) for k, s in as_dict(spaces[0]).items()}
+            for _ in range(2)
+        ]
+        self.rewards, self.actions = torch.zeros(num_envs), torch.zeros(num_envs, *spaces[1].shape)
+        self.terminated, self.truncated = torch.zeros(2, num_envs, dtype=torch.bool)
+        buffers = [self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions]
+        for buffer in (*self.obs.values(), *self.reset_obs.values(), *buffers[2:]):
+            buffer.share_memory_()
+        self._send([buffers] * len(self.conns))
+        self.infos, self.reset_infos = {}, []
+
+    def _send(self, messages):
+        for conn, message in zip(self.conns, messages):
+            with contextlib.suppress(ConnectionError):  # _receive tells what became of the worker
+                conn.send(message)
+
+    def _receive(self, w):
+        try:
+            message = self.conns[w].recv()
+        except (EOFError, ConnectionResetError):
+            self.workers[w].join(5)
+            code = self.workers[w].exitcode
+            message = RunError(f"died with exit code {code}" + " (killed; out of memory?)" * (code == -9))
+        if isinstance(message, RunError):
+            raise RunError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}) {message}")
+        return message
+
+    @staticmethod
+    def _concatenate(infos):
+        return {
+            k: torch.from_numpy(np.concatenate([info[k] for info in infos])) if isinstance(v, np.ndarray) else v
+            for k, v in infos[0].items()
+        }
+
+    def _observation(self):
+        obs = {k: v.clone() for k, v in self.obs.items()}
+        return obs if isinstance(self.single_observation_space, gym.spaces.Dict) else obs["state"]
+
+    @property
+    def elapsed_steps(self) -> torch.Tensor:
+        return self.infos["elapsed_steps"]
+
+    def step(self, actions: torch.Tensor):
+        self.actions.copy_(actions)
+        self._send([("step",)] * len(self.conns))
+        infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
+        self.infos = self._concatenate(infos)
+        results = [x.clone() for x in (self.rewards, self.terminated, self.truncated)]
+        return self._observation(), *results, dict(self.infos)
+
+    def reset(self, *, seed=None, options=None):
+        options = dict(options or {})
+        env_idx = torch.as_tensor(options.pop("env_idx", range(self.num_envs))).sort().values
+        if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
+            if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
+                seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
+            chosen = [[i for i, index in enumerate(share) if (env_idx == index).any()] for share in self.shares]
+            seeds = [seed and [seed[index] for index in share] for share in self.shares]
+            self._send([("reset", rows, s, options) for rows, s in zip(chosen, seeds)])
+            self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
+        infos = self._concatenate([info for info in self.reset_infos if info])
+        self.reset_infos = []
+        for k, v in infos.items():
+            if isinstance(v, torch.Tensor) and len(env_idx) < self.num_envs:
+                infos[k] = self.infos[k].index_copy(0, env_idx, v)
+        self.infos = infos
+        for k, obs in self.obs.items():
+            obs[env_idx] = self.reset_obs[k][env_idx]
+        return self._observation(), dict(infos)
+
+    def close(self):
+        for conn in self.conns:
+            conn.close()  # which is how a worker learns that it is over
+        for worker in self.workers:
+            worker.join(30)
+            worker.kill()
+
+
+def workers_memory(envs: ManiSkillVectorEnv) -> float:
+    """Resident memory in MiB of the worker processes, if any; RunError where one of them has died."""
+    if not isinstance(envs.base_env, CPUVectorEnv):
+        return 0.0
+    dead = [w for w, worker in enumerate(envs.base_env.workers) if not worker.is_alive()]
+    if dead:
+        envs.base_env._receive(dead[0])
+    return sum(psutil.Process(worker.pid).memory_info().rss for worker in envs.base_env.workers) / 2**20
+
+
+def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
+    """The training or the evaluation environments as one batch. Those for evaluation do not reset by themselves:
+    `evaluate` starts each episode from its seed."""
+    num_envs = args.num_eval_envs if evaluation else args.num_envs
+    ignore_terminations = not (args.eval_partial_reset if evaluation else args.partial_reset)
+    make = partial(make_env, args, record_dir, evaluation)
+    if args.sim_backend == "physx_cpu" and num_envs > 1:
+        what = "building evaluation environments" if evaluation else "building training environments"
+        env = CPUVectorEnv(make, num_envs, num_cores(), not evaluation, ignore_terminations, what)
+    else:
+        env = make(num_envs=num_envs)
+    return ManiSkillVectorEnv(
+        env, auto_reset=not evaluation, ignore_terminations=ignore_terminations, record_metrics=True
+    )
+
+
+# ----- Agent ----------------------------------------------------------------------------------------------------------
+
+
+def layer_init(layer: nn.Linear, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, std)
+    nn.init.constant_(layer.bias, bias_const)
+    return layer
+
+
+class ResidualBlock(nn.Module):
+    def __init__(self, channels: int):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+        )
+
+    def forward(self, x):
+        return x + self.layers(x)
+
+
+class Encoder(nn.Module):
+    """Textures of a batch of observations to features, float32 (batch, 256). Replace it by what you like.
+
+    "nature" is the network of Mnih et al. 2015 (doi 10.1038/nature14236), "impala" the residual one of Espeholt et al.
+    2018 (arXiv 1802.01561, fig. 3), both on all textures, cameras and frames together, as channels of one image."""
+
+    num_features = 256
+
+    def __init__(self, obs_space: gym.spaces.Dict, args: Args):
+        super().__init__()
+        self.amp, self.channels_last = args.amp, args.channels_last
+        self.segment_embedding = nn.Embedding(256, 3) if "segmentation" in obs_space.spaces else None
+        example = self.to_image({k: torch.zeros(1, *v.shape) for k, v in obs_space.items()})
+        channels = example.shape[1]
+        if args.encoder == "nature":
+            layers = []
+            for width, kernel, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
+                layers += [layer_init(nn.Conv2d(channels, width, kernel, stride)), nn.ReLU()]
+                channels = width
+        else:
+            layers = []
+            for width in (16, 32, 32):
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.MaxPool2d(3, stride=2, padding=1)]
+                layers += [ResidualBlock(width), ResidualBlock(width)]
+                channels = width
+            layers.append(nn.ReLU())
+        layers.append(nn.Flatten())
+        with torch.no_grad():
+            num_flat = nn.Sequential(*layers)(example).shape[1]
+        self.network = nn.Sequential(*layers, layer_init(nn.Linear(num_flat, self.num_features)), nn.ReLU())
+        if args.channels_last:
+            self.network.to(memory_format=torch.channels_last)
+
+    def to_image(self, obs: dict) -> torch.Tensor:
+        """All textures as channels of one float32 image (batch, channels, height, width), of comparable scale."""
+        images = []
+        for k, x in obs.items():
+            if k in ("rgb", "albedo"):
+                images.append(x.float() / 255 - 0.5)
+            elif k == "depth":  # nearness: 1 at the camera, 1/2 at one metre, 0 where there is nothing
+                images.append((x > 0) / (1 + x.float() / 1000))
+            elif k == "position":
+                images.append(x.float() / 1000)
+            elif k == "segmentation":  # ids are names, not quantities
+                images.append(self.segment_embedding(x.long() % 256).flatten(-2))
+            elif k == "normal":
+                images.append(x)
+        image = torch.cat(images, dim=-1).permute(0, 3, 1, 2)  # which is channels-last already
+        return image if self.channels_last else image.contiguous()
+
+    def forward(self, obs: dict) -> torch.Tensor:
+        image = self.to_image(obs)
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.amp):
+            return self.network(image).float()
+
+
+class Agent(nn.Module):
+    """Gaussian policy with state-independent standard deviation, and value function, on shared features of the images,
+    to which the state is joined.
+
+    Observations are dicts as ImageObservations makes them, actions float32 (batch, act_dim), values and
+    log-probabilities (batch,)."""
+
+    def __init__(self, obs_space: gym.spaces.Dict, action_space: gym.spaces.Box, args: Args):
+        super().__init__()
+        act_dim = action_space.shape[0]
+        state_dim = obs_space["state"].shape[0] if "state" in obs_space.spaces else 0
+        self.encoder = Encoder(obs_space, args)
+        num_features = self.encoder.num_features + state_dim
+
+        def head(size, std):
+            return nn.Sequential(
+                layer_init(nn.Linear(num_features, 256)), nn.Tanh(),
+                layer_init(nn.Linear(256, 256)), nn.Tanh(),
+                layer_init(nn.Linear(256, size), std),
+            )  # fmt: skip
+
+        self.actor_mean = head(act_dim, 0.01 * math.sqrt(2))
+        self.actor_logstd = nn.Parameter(torch.full((1, act_dim), args.logstd_init))
+        self.critic = head(1, math.sqrt(2))
+        self.norm_obs = args.norm_obs
+        self.register_buffer("obs_mean", torch.zeros(state_dim))
+        self.register_buffer("obs_var", torch.ones(state_dim))
+        self.register_buffer("obs_count", torch.tensor(1e-4))
+
+    def features(self, obs):
+        features = self.encoder(obs)
+        if not self.obs_mean.numel():
+            return features
+        state = obs["state"]
+        if self.norm_obs:
+            state = ((state - self.obs_mean) * torch.rsqrt(self.obs_var + 1e-5)).clamp(-10, 10)
+        return torch.cat([features, state], dim=1)
+
+    @torch.no_grad()
+    def update_normalization(self, obs):
+        """Merge the mean and variance of a batch of states into the running ones (Chan et al. 1979)."""
+        if not self.obs_mean.numel():
+            return
+        state = obs["state"]
+        count = self.obs_count + len(state)
+        delta = state.mean(0) - self.obs_mean
+        m2 = self.obs_var * self.obs_count + state.var(0, correction=0) * len(state)
+        self.obs_var.copy_((m2 + delta**2 * self.obs_count * len(state) / count) / count)
+        self.obs_mean.add_(delta * len(state) / count)
+        self.obs_count.copy_(count)
+
+    def get_value(self, obs):
+        return self.critic(self.features(obs)).squeeze(-1)
+
+    def get_action(self, obs):
+        """The deterministic action: the mean of the policy."""
+        return self.actor_mean(self.features(obs))
+
+    def get_action_and_value(self, obs, action=None):
+        """Returns action (sampled unless given), its log-probability, the policy's entropy, and the value."""
+        features = self.features(obs)
+        mean = self.actor_mean(features)
+        policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
+        if action is None:
+            action = policy.sample()
+        value = self.critic(features).squeeze(-1)
+        return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
+
+
+def random_shift(obs: dict, pad: int) -> dict:
+    """Shift the images of each observation by up to `pad` pixels in both directions, their borders repeated: the
+    augmentation of DrQ (Kostrikov et al. 2020, arXiv 2004.13649). The state stays."""
+    batch, height, width = next(v for k, v in obs.items() if k != "state").shape[:3]
+    device = next(iter(obs.values())).device
+    shift = torch.randint(-pad, pad + 1, (2, batch, 1), device=device)
+    rows = (torch.arange(height, device=device) + shift[0]).clamp(0, height - 1)[:, :, None]
+    columns = (torch.arange(width, device=device) + shift[1]).clamp(0, width - 1)[:, None, :]
+    each = torch.arange(batch, device=device)[:, None, None]
+    return {k: v if k == "state" else v[each, rows, columns] for k, v in obs.items()}
+
+
+# ----- Algorithm ------------------------------------------------------------------------------------------------------
+
+
+def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_horizon=False):
+    """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
+
+    Args:
+        rewards, values: (num_steps, num_envs), of the step and of the observation it started from.
+        next_values: (num_steps, num_envs), value of the step's true next observation (at the end of an episode: the
+            final one, not the reset one), zero where the episode's end is not to be bootstrapped.
+        dones: (num_steps, num_envs), whether the episode ended with the step.
+        finite_horizon: False: eq. 16, line 2, the infinite lambda-weighted sum. True: line 1, the lambda-weighted mean
+            over those n-step returns that exist before the episode or the rollout ends.
+
+    Returns:
+        (advantages, returns), each (num_steps, num_envs); returns = advantages + values.
+    """
+    not_done = 1.0 - dones.to(rewards.dtype)
+    advantages = torch.zeros_like(rewards)
+    if finite_horizon:
+        # sums over n of lambda^(n-1) times: 1, the rewards within n steps, the value after n steps
+        weight_sum = reward_sum = value_sum = torch.zeros_like(rewards[0])
+        for t in reversed(range(len(rewards))):
+            weight_sum = 1.0 + gae_lambda * not_done[t] * weight_sum
+            reward_sum = weight_sum * rewards[t] + gamma * gae_lambda * not_done[t] * reward_sum
+            value_sum = gamma * next_values[t] + gamma * gae_lambda * not_done[t] * value_sum
+            advantages[t] = (reward_sum + value_sum) / weight_sum - values[t]
+    else:
+        deltas = rewards + gamma * next_values - values
+        decay = gamma * gae_lambda * not_done
+        last = torch.zeros_like(rewards[0])
+        for t in reversed(range(len(rewards))):
+            advantages[t] = last = deltas[t] + decay[t] * last
+    return advantages, advantages + values
+
+
+def bootstraps(rule: str, terminated: torch.Tensor, truncated: torch.Tensor) -> torch.Tensor:
+    """Whether the value of an episode's final observation counts, for each environment, bool (num_envs,).
+
+    ManiSkill's rewards are positive at every step, so that without it ("never") an early success would be worth less
+    than dawdling; "truncated" is the textbook's rule (Pardo et al. 2018, arXiv 1712.00378)."""
+    if rule == "truncated":
+        return truncated & ~terminated
+    return torch.full_like(truncated, rule == "always")
+
+
+UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac", "grad_norm")
+KL = UPDATE_METRICS.index("approx_kl")
+
+
+def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values) -> torch.Tensor:
+    """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows.
+
+    Returns the UPDATE_METRICS of the minibatch, one tensor on the device."""
+    _, newlogprob, entropy, newvalue = agent.get_action_and_value(obs, actions)
+    logratio = newlogprob - logprobs
+    ratio = logratio.exp()
+    if args.norm_adv:
+        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+
+    clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    policy_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+    value_error = (newvalue - returns) ** 2
+    if args.clip_vloss:
+        clipped_value = values + (newvalue - values).clamp(-args.clip_coef, args.clip_coef)
+        value_error = torch.max(value_error, (clipped_value - returns) ** 2)
+    value_loss = 0.5 * value_error.mean()
+    entropy = entropy.mean()
+    loss = policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss
+
+    optimizer.zero_grad()
+    loss.backward()
+    grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+    optimizer.step()
+
+    with torch.no_grad():
+        approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
+        return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
+
+
+# ----- Evaluation -----------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def evaluate(
+    agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
+) -> dict[str, torch.Tensor]:
+    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k (on a
+    GPU ManiSkill draws those of a batch from its first seed).
+
+    Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
+    float tensor (num_episodes,) each, on the CPU."""
+    low, high = action_bounds(envs, device)
+    rounds = []
+    seed_all(seed)  # for tasks that draw during an episode
+    for first in range(seed, seed + num_episodes, envs.num_envs):
+        obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
+        running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
+        episodes = {}
+        for step in range(1, num_steps + 1):
+            action = agent.get_action(to_device(obs, device)).clamp(low, high).nan_to_num()
+            obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
+            ended = running & (terminated | truncated | (step == num_steps))
+            running &= ~ended
+            at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
+            for k, v in (infos["episode"] | at_end).items():
+                episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+        rounds.append(episodes)
+    return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"}
+
+
+def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
+    """95% confidence interval of the mean of `values`: Wilson's score interval for a rate, else the normal one."""
+    n, mean, z = len(values), values.double().mean().item(), 1.96
+    if rate:
+        centre = (mean + z**2 / (2 * n)) / (1 + z**2 / n)
+        half = z / (1 + z**2 / n) * math.sqrt(mean * (1 - mean) / n + z**2 / (4 * n**2))
+    else:
+        centre = mean
+        half = z * values.double().std().item() / math.sqrt(n) if n > 1 else math.inf
+    return centre - half, centre + half
+
+
+# ----- Checkpoints and results ----------------------------------------------------------------------------------------
+
+
+CHECKPOINT_KEYS = {
+    "agent", "optimizer", "iteration", "global_step", "best_score", "metrics_size", "wandb_id", "args", "versions",
+}  # fmt: skip
+
+
+def save_checkpoint(path: Path, contents: dict) -> None:
+    """Write beside, then rename: at any instant the file is the old checkpoint or the new one, whole.
+
+    Raises OSError where it cannot be written."""
+    buffer = io.BytesIO()
+    torch.save(contents, buffer)
+    with open(path.with_suffix(".tmp"), "wb") as file:
+        file.write(buffer.getbuffer())
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(file.name, path)
+
+
+def load_checkpoint(path: Optional[str | Path]) -> dict:
+    if path is None:
+        fail("--evaluate needs --checkpoint runs/NAME/best.pt")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        fail(f"there is no checkpoint {path}")
+    except Exception as error:
+        fail(f"{path} is not, or no longer, a readable checkpoint: {str(error).partition('. ')[0] or 'it is empty'}")
+    lacking = CHECKPOINT_KEYS - checkpoint.keys() if isinstance(checkpoint, dict) else CHECKPOINT_KEYS
+    if lacking:
+        fail(f"{path} is no checkpoint of this version of the script: it lacks {', '.join(sorted(lacking))}")
+    return checkpoint
+
+
+def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path, args: Args) -> None:
+    """Give the agent the weights of a checkpoint, or refuse those of another task or network."""
+    expected, found = [{k: tuple(v.shape) for k, v in x.items()} for x in (agent.state_dict(), checkpoint["agent"])]
+    for k in {**expected, **found}:
+        if expected.get(k) != found.get(k):
+            task = checkpoint["args"]["env_id"]
+            fail(f"{path} ({task}) does not fit {args.env_id}: {k}: expected {expected.get(k)}, found {found.get(k)}")
+    agent.load_state_dict(checkpoint["agent"])
+
+
+def name_videos(folder: Path, name: str) -> list[Path]:
+    """RecordEpisode numbers its files; name the new ones after the evaluation that they show."""
+    numbered = sorted(path for path in folder.glob("*.mp4") if path.stem.isdigit())
+    names = [f"{name}.mp4" if len(numbered) == 1 else f"{name}_{i}.mp4" for i in range(len(numbered))]
+    return [path.replace(folder / new) for path, new in zip(numbered, names)]
+
+
+def read_metrics(run_dir: Path) -> Iterator[dict]:
+    with open(run_dir / "metrics.jsonl") as file:
+        yield from (json.loads(line) for line in file if line.endswith("\n"))  # a full disk may have cut one off
+
+
+def add_scalars(writer, row: dict) -> None:
+    for key in row.keys() - {"kind", "global_step", "time"}:
+        writer.add_scalar(f"{row['kind']}/{key}", row[key], row["global_step"], walltime=row["time"])
+
+
+def open_tensorboard(run_dir: Path):
+    """A writer of TensorBoard events that begins with what metrics.jsonl holds: of a resumed run no row is missing, and
+    none is there twice."""
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the workers need none
+
+    for old in run_dir.glob("events.out.tfevents.*"):
+        old.unlink()
+    writer = SummaryWriter(str(run_dir))
+    for row in read_metrics(run_dir):
+        add_scalars(writer, row)
+    return writer
+
+
+def plot_learning_curve(run_dir: Path) -> None:
+    """Draw learning_curve.png from metrics.jsonl: success, where the task knows it, and return over steps."""
+    from matplotlib.figure import Figure
+
+    points = defaultdict(list)
+    for row in read_metrics(run_dir):
+        for key in row.keys() & {"success_once", "return"}:
+            points[key, row["kind"]].append((row["global_step"], row[key]))
+    keys = sorted({key for key, _ in points}, reverse=True)
+    if not keys:
+        return
+    figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
+    for axis, key in zip(np.atleast_1d(figure.subplots(1, len(keys))), keys):
+        for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
+            if (key, kind) in points:
+                axis.plot(*zip(*points[key, kind]), label={"train": "training", "eval": "evaluation"}[kind], **style)
+        axis.set(title=key, xlabel="environment steps", ylim=(-0.03, 1.03) if key == "success_once" else None)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    figure.savefig(run_dir / "learning_curve.png", dpi=120)
+    del figure, axis
+    gc.collect()  # figures refer to themselves: megabytes that would else stay for long
+
+
+# ----- Main -----------------------------------------------------------------------------------------------------------
+
+
+LIMITS = (  # of numbers that are given; none may be infinite or not a number
+    (1, 1e18, "num_envs num_eval_envs num_steps num_minibatches update_epochs num_eval_episodes num_eval_steps "
+              "total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+    (1, 32, "frame_stack"),
+    (36, 4096, "camera_width camera_height"),  # NatureCNN's convolutions need 36 pixels
+    (0, 32, "random_shift"),
+    (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (0, 1e18, "seed critic_learning_rate ent_coef vf_coef target_kl eval_freq eval_seed reconfiguration_freq "
+              "eval_reconfiguration_freq"),
+    (0, 1, "gamma gae_lambda stop_at_success"),
+    (-20, 5, "logstd_init"),
+)  # fmt: skip
+
+
+def check(args: Args) -> None:
+    """Refuse what cannot work, before anything is built or written; warn of what hardly can."""
+    for low, high, flags in LIMITS:
+        for flag in flags.split():
+            if getattr(args, flag) is not None and not low <= getattr(args, flag) <= high:
+                fail(f"--{flag} {getattr(args, flag)}: must lie between {low:g} and {high:g}")
+    if args.batch_size < args.num_minibatches:
+        fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
+    if not args.evaluate and args.num_iterations < 1:
+        fail(f"--total_timesteps {args.total_timesteps} is less than one iteration of {args.batch_size} steps")
+    if not 0 <= args.eval_seed < 2**31 - args.num_eval_episodes - args.num_eval_envs:
+        fail("--eval_seed must be at least 0, and the seeds of all evaluation episodes below 2^31")
+
+    # --- the machine ---
+    if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
+        fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
+    on_gpu = args.sim_backend != "physx_cpu"
+    if on_gpu and not args.cuda:
+        fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
+    if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
+        try:
+            torch.zeros(1, device=choose_device(args) if on_gpu else "cuda")
+            if on_gpu:
+                sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
+        except Exception as error:  # no driver, one too old for this torch, no such device, no library
+            reason = str(error).splitlines()[0]
+            if on_gpu:
+                remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in reason else "see examples/check_machine.py"
+                fail(f"--sim_backend {args.sim_backend}: {reason}: {remedy}, or use --sim_backend physx_cpu")
+            args.cuda = False
+            print(f"the GPU is not used: {reason}")
+    try:
+        parse_backends(args.sim_backend, args.render_backend)
+    except (KeyError, ValueError, RuntimeError) as error:
+        fail(f"--render_backend {args.render_backend}: {error}; use gpu, gpu:N, cpu or none")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        fail("--track needs Weights & Biases: pip install wandb")
+
+    # --- the task ---
+    name = args.env_id.rpartition(":")[2]
+    try:
+        spec = find_task(args.env_id)
+    except KeyError:
+        nearest = ", ".join(difflib.get_close_matches(name, REGISTERED_ENVS)) or "none"
+        fail(f"--env_id {args.env_id}: no such task; names like it: {nearest}")
+    except Exception as error:  # the user's module
+        fail(f"--env_id {args.env_id}: {type(error).__name__}: {error}")
+    known = {"max_episode_steps"}.union(*(inspect.signature(cls.__init__).parameters for cls in spec.cls.__mro__))
+    try:
+        env_kwargs = dict(**json.loads(args.env_kwargs))
+    except (ValueError, TypeError):
+        fail(f"--env_kwargs must be a JSON object like '{{\"enhanced_determinism\": true}}', not {args.env_kwargs}")
+    for k in env_kwargs:
+        if hasattr(args, k):
+            fail(f"--env_kwargs: {k} has a flag of its own: --{k}")
+        if k not in known:
+            fail(f"--env_kwargs: {name} takes no {k}, but {', '.join(sorted(known - {'self', 'args', 'kwargs'}))}")
+    horizon = env_kwargs.get("max_episode_steps", spec.max_episode_steps)
+    if not (horizon is None or isinstance(horizon, int) and horizon > 0):
+        fail(f"--env_kwargs: max_episode_steps {horizon}: must be an integer of at least 1")
+    if args.reward_mode not in (None, *spec.cls.SUPPORTED_REWARD_MODES):
+        fail(f"--reward_mode {args.reward_mode}: {name} has {', '.join(spec.cls.SUPPORTED_REWARD_MODES)}")
+    # not the parameters that it inherits: it may fix them
+    own = inspect.signature(spec.cls.__init__).parameters.get("robot_uids")
+    robots = args.robot_uids or spec.default_kwargs.get("robot_uids", own and own.default)
+    assets = [name]
+    robots = robots.split(",") if isinstance(robots, str) else robots
+    robots = robots if isinstance(robots, (tuple, list)) else [robots]
+    check_observations(args, spec, robots)
+    for robot in robots:
+        if not isinstance(robot, str) or robot == "none" and not args.robot_uids:
+            continue  # tasks may bring a class of their own
+        if robot not in REGISTERED_AGENTS:
+            fail(f"--robot_uids {robot}: no such robot, but {spec.cls.SUPPORTED_ROBOTS or [*REGISTERED_AGENTS]}")
+        assets.append(robot)
+        with contextlib.suppress(Exception):  # some robots know their controllers only once they are built
+            agent_cls = REGISTERED_AGENTS[robot].agent_cls
+            modes = agent_cls.__new__(agent_cls)._controller_configs
+            if args.control_mode not in (None, *modes):
+                fail(f"--control_mode {args.control_mode}: {robot} has {', '.join(modes)}")
+    for asset in assets:
+        if not all(map(is_data_source_downloaded, expand_data_group_into_individual_data_source_ids(asset))):
+            fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {asset}")
+    if args.reconfiguration_freq and args.partial_reset and on_gpu and not args.evaluate:
+        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
+
+    # --- the folder ---
+    run_dir = find_run_dir(args)
+    try:
+        if not (args.resume or args.evaluate):
+            metrics = run_dir / "metrics.jsonl"
+            if (run_dir / "last.pt").exists() or metrics.exists() and metrics.stat().st_size > 0:
+                fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
+        absolute = Path(os.path.abspath(run_dir))
+        existing = next(path for path in (absolute, *absolute.parents) if path.exists())
+        if not (existing.is_dir() and os.access(existing, os.W_OK)):
+            fail(f"{run_dir} cannot be written: {existing} is no folder, or not yours to write")
+    except OSError as error:
+        fail(f"{run_dir} cannot be written: {error}")
+
+    # --- what may be meant otherwise ---
+    if horizon and args.num_eval_steps and args.num_eval_steps < horizon:
+        print(f"note: --num_eval_steps {args.num_eval_steps} ends before an episode does: all {horizon} steps are run")
+    if not args.evaluate:
+        if (args.reward_mode or default_reward_mode(spec.cls)) in ("sparse", "none"):
+            print(f"note: the reward of {name} is not dense: PPO may never meet a success to learn from")
+        if horizon and args.gamma < 1 and not horizon / 25 <= 1 / (1 - args.gamma) <= 10 * horizon:
+            print(f"note: --gamma {args.gamma} looks {1 / (1 - args.gamma):.0f} steps ahead, and episodes of {name} "
+                  f"have {horizon}: about {1 - 10 / max(horizon, 20):.3g} may suit it better")  # fmt: skip
+
+
+def image_bytes(args: Args, camera_sizes: list[tuple[int, int]]) -> int:
+    """What the images of a rollout take, for cameras of these (height, width)."""
+    channels = [TEXTURES[k] * {"rgb": 1, "albedo": 1, "normal": 4}.get(k, 2) for k in args.obs_mode.split("+")]
+    pixels = sum((args.camera_height or height) * (args.camera_width or width) for height, width in camera_sizes)
+    return args.num_steps * args.num_envs * args.frame_stack * pixels * sum(channels)
+
+
+def check_observations(args: Args, spec, robots: list) -> None:
+    """Refuse images that nothing can render, and more of them than the learner's device can hold."""
+    textures = args.obs_mode.split("+")
+    if not set(textures) <= TEXTURES.keys() or len(set(textures)) < len(textures):
+        fail(f"--obs_mode {args.obs_mode}: must be some of {', '.join(TEXTURES)}, joined by +")
+    modes = spec.cls.SUPPORTED_OBS_MODES
+    if args.obs_mode not in modes and "any_textures" not in modes:
+        fail(f"--obs_mode {args.obs_mode}: {args.env_id} has {', '.join(modes)}")
+    if args.shader is None:
+        args.shader = "default" if {"normal", "albedo"} & set(textures) else "minimal"
+    if args.shader == "minimal" and {"normal", "albedo"} & set(textures):
+        fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
+    on_gpu = args.sim_backend != "physx_cpu"
+    if args.render_backend == "none":
+        fail("--render_backend none: images must be rendered; to learn from the state: ppo.py")
+    if RENDER_DEVICE is None or on_gpu and not RENDER_DEVICE.is_cuda():
+        fail(f"there is no Vulkan device to render images: {how_to_render(on_gpu)}, and see examples/check_machine.py; "
+             "to learn from the state: ppo.py")  # fmt: skip
+
+    # the cameras without the task: they rarely depend on anything that is built
+    configs = []
+    agents = [REGISTERED_AGENTS[robot].agent_cls for robot in robots if robot in REGISTERED_AGENTS]
+    for cls, name in [(spec.cls, "_default_sensor_configs"), *((cls, "_sensor_configs") for cls in agents)]:
+        with contextlib.suppress(Exception), patch("mani_skill.utils.sapien_utils.look_at", return_value=sapien.Pose()):
+            found = getattr(cls, name).fget(MagicMock())
+            configs += found if isinstance(found, list) else [found]
+    check_memory(args, [(config.height, config.width) for config in configs])
+
+
+def check_memory(args: Args, camera_sizes: list[tuple[int, int]]) -> None:
+    device, needed = choose_device(args), image_bytes(args, camera_sizes)
+    if args.evaluate or not needed:
+        return
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+    sizes = ", ".join(f"{args.camera_width or w}x{args.camera_height or h}" for h, w in camera_sizes)
+    print(f"images of a rollout ({sizes}, {args.num_steps} steps of {args.num_envs} environments): "
+          f"{needed / 2**20:,.1f} MiB of {free / 2**20:,.0f} free")  # fmt: skip
+    if needed > 0.9 * free:
+        fail(f"the images of a rollout do not fit on the learner's device: try --num_steps "
+             f"{max(1, int(args.num_steps * 0.5 * free / needed))}, fewer environments or smaller images")  # fmt: skip
+
+
+def choose_device(args: Args) -> torch.device:
+    """Where the agent learns: with the simulation on its GPU, else on any GPU there is, else on the CPU."""
+    if args.sim_backend.startswith("physx_cuda"):
+        return torch.device(args.sim_backend.replace("physx_", ""))
+    return torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+
+
+def summary(metrics: dict) -> list[str]:
+    """The metrics that a person follows, in a few words."""
+    names = {"success_once": "success", "return": "return", "episode_len": "length"}
+    return [f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics]
+
+
+def action_bounds(envs, device) -> tuple[torch.Tensor, torch.Tensor]:
+    space = envs.single_action_space
+    return torch.as_tensor(space.low, device=device), torch.as_tensor(space.high, device=device)
+
+
+def how_to_render(on_gpu: bool) -> str:
+    if on_gpu:
+        return "NVIDIA_DRIVER_CAPABILITIES=all in a container"
+    return "apt install mesa-vulkan-drivers, 23.1 or newer, which Debian 12 has in its backports"
+
+
+def prepare_rendering(args: Args) -> None:
+    """Render on the GPU that simulates."""
+    if args.sim_backend != "physx_cpu" and args.render_backend == "gpu":
+        args.render_backend = args.sim_backend.replace("physx_cuda", "gpu")
+
+
+def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
+    """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
+    run_dir, device = find_run_dir(args), choose_device(args)
+    prepare_rendering(args)
+    torch.set_num_threads(1)
+    envs = make_envs(args, run_dir / "test_videos", evaluation=True)
+    closing.callback(envs.close)
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
+    num_episodes, num_steps = evaluation_size(envs, args)
+    episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
+    envs.close()  # which completes the videos
+    videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
+
+    results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
+    print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {args.eval_seed} on, 95% intervals:")
+    for key, values in episodes.items():
+        low, high = interval(values, rate=key.startswith(("success", "fail")))
+        results |= {key: values.mean().item(), f"{key}_interval": [low, high]}
+        print(f"  {key:<16}{results[key]:8.3f}  [{low:.3f}, {high:.3f}]")
+    (run_dir / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
+    print(f"written: {', '.join(map(str, [run_dir / 'eval.json', *videos]))}")
+    return 0
+
+
+def train(args: Args, closing: contextlib.ExitStack) -> int:
+    """The training run, from the folder to the last checkpoint; the loop stands here in one piece.
+
+    However it ends from there on, `closing` keeps what was learned and ends the workers. Returns the exit code."""
+    # --- environments, agent ---
+    for s in STOP_SIGNALS:
+        closing.callback(signal.signal, s, signal.getsignal(s))
+    run_dir, device = find_run_dir(args), choose_device(args)
+    given = asdict(args)  # a resumed run may find the renderer that this one lacks
+    prepare_rendering(args)
+    resumed = load_checkpoint(args.resume) if args.resume else {}
+    first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
+    if first_iteration > args.num_iterations:
+        fail(f"--total_timesteps {args.total_timesteps} is less than the {global_step} steps of {args.resume}")
+    best_score = resumed.get("best_score", [-math.inf])
+    if resumed and (run_dir / "best.pt").exists():  # which may be newer than the checkpoint
+        best_score = max(best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+    torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
+    seed_all(args.seed)
+
+    envs = make_envs(args, run_dir / "train_videos")
+    closing.callback(envs.close)
+    obs_space, action_space = envs.single_observation_space, envs.single_action_space
+    low, high = action_bounds(envs, device)
+
+    agent = Agent(obs_space, action_space, args).to(device)
+    critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
+    critic = [p for name, p in agent.named_parameters() if name.startswith("critic")]
+    actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
+    groups = [{"params": p, "lr": lr, "peak_lr": lr} for p, lr in ((actor, args.learning_rate), (critic, critic_lr))]
+    optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
+    if resumed:
+        load_weights(agent, resumed, args.resume, args)
+        optimizer.load_state_dict(resumed["optimizer"])
+    elif args.checkpoint:
+        load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
+
+    eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
+    closing.callback(eval_envs.close)
+    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, args)
+
+    # --- logging ---
+    run_dir.mkdir(parents=True, exist_ok=True)
+    packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
+    about = {
+        "args": asdict(args),
+        "versions": {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in packages},
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {num_cores()} cores",
+        "command": shlex.join(sys.argv),
+    }
+    (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
+    wandb, wandb_id = None, resumed.get("wandb_id")
+    if args.track:
+        import wandb
+
+        wandb_id = wandb.init(
+            project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
+            config=about, save_code=True, id=wandb_id, resume="allow",
+        ).id  # fmt: skip
+        closing.push(lambda error, *_: wandb.finish(exit_code=int(error is not None)))
+    metrics_file, writer = open(run_dir / "metrics.jsonl", "ab"), None
+    kept = (run_dir / "metrics.jsonl").read_bytes()[: resumed.get("metrics_size", 0)]  # later steps are done again
+    metrics_file.truncate(kept.rfind(b"\n") + 1)
+    metrics_file.seek(0, os.SEEK_END)
+
+    @closing.callback
+    def close_files():
+        for file in (metrics_file, writer):
+            with contextlib.suppress(OSError, AttributeError):  # a full disk, of which was told; no writer yet
+                file.close()
+
+    bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+    total = args.num_iterations * args.batch_size
+    bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=None, bar_format=bar_format)
+    closing.callback(bar.close)
+    bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
+    bar.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
+
+    def log(kind: str, metrics: dict) -> None:
+        nonlocal writer
+        finite = {k: v for k, v in metrics.items() if math.isfinite(v)}
+        row = {"kind": kind, "global_step": global_step, "time": time.time(), **finite}
+        try:
+            metrics_file.write(json.dumps(row).encode() + b"\n")
+            metrics_file.flush()
+            if writer is None:
+                writer = open_tensorboard(run_dir)
+            else:
+                add_scalars(writer, row)
+        except OSError:  # the file keeps the row for the next flush; the writer is made anew from the file
+            writer = None
+            raise
+        finally:
+            if wandb:
+                wandb.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
+
+    def attempt(what: str, function, *arguments) -> bool:
+        """Write something; where that fails, as on a full disk, say so and go on, unless it fails again and again."""
+        try:
+            function(*arguments)
+            failures[what] = 0
+            return True
+        except OSError as error:
+            failures[what] += 1
+            bar.write(f"{what} could not be written, training goes on: {error}")
+            if failures[what] == MAX_FAILURES:
+                raise RunError(f"{what} could not be written {MAX_FAILURES} times in a row: {error}") from None
+        return False
+
+    def save(name: str, contents: dict) -> bool:
+        return not args.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
+
+    # --- rollout storage ---
+    shape = (args.num_steps, args.num_envs)
+    obs = {  # images in the dtype in which they were rendered: as numbers they would take four times the memory
+        k: torch.zeros(*shape, *space.shape, dtype=getattr(torch, space.dtype.name), device=device)
+        for k, space in obs_space.items()
+    }
+    actions = torch.zeros(*shape, *action_space.shape, device=device)
+    logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
+
+    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
+    rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
+
+    # --- how it may end ---
+    finished, stopped_by, failures = False, 0, Counter()
+    last_line = last_saved = time.monotonic()
+
+    def stop(signum, frame):
+        nonlocal stopped_by
+        stopped_by = signum
+        for s in STOP_SIGNALS:
+            signal.signal(s, signal.SIG_DFL)  # a second one ends the process at once
+        os.write(2, f"\n{signal.Signals(signum).name}: stopping after this iteration; again: at once\n".encode())
+
+    for s in STOP_SIGNALS:
+        signal.signal(s, stop)
+
+    @closing.callback
+    def save_last():
+        if finished or not args.exact_resume:  # with it, a run goes on from a boundary only
+            save("last.pt", snapshot)
+
+    for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
+        # --- checkpoint: here a resumed run goes on, and to here an update that goes wrong is taken back ---
+        snapshot = {
+            "agent": copy.deepcopy(agent.state_dict()), "optimizer": copy.deepcopy(optimizer.state_dict()),
+            "iteration": iteration, "global_step": global_step, "best_score": best_score,
+            "metrics_size": metrics_file.tell(), "wandb_id": wandb_id, "args": given, "versions": about["versions"],
+        }  # fmt: skip
+        minutes = (time.monotonic() - last_saved) / 60
+        if iteration % args.checkpoint_freq == 0 or (minutes > args.checkpoint_minutes and not args.exact_resume):
+            save("last.pt", snapshot)
+            last_saved = time.monotonic()
+        if args.save_freq and iteration > 0 and iteration % args.save_freq == 0:
+            save(f"iteration_{iteration}.pt", snapshot)
+
+        # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
+        finished = iteration == args.num_iterations and not stopped_by
+        if finished or not stopped_by and (iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0):
+            episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
+            metrics = {key: value.mean().item() for key, value in episodes.items()}
+            attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": num_eval_episodes})
+            name_videos(run_dir / "videos", f"step_{global_step:09d}")
+            score = [metrics[key] for key in ("success_once", "return") if key in metrics]
+            best = score > best_score and all(map(math.isfinite, score))
+            bar.write(f"step {global_step:>9,}  evaluation: {', '.join(summary(metrics))}" + "  (best)" * best)
+            if best and save("best.pt", snapshot | {"best_score": score}):
+                best_score = score
+            attempt("learning_curve.png", plot_learning_curve, run_dir)
+            if args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success:
+                finished = True
+        if finished or stopped_by:
+            break
+
+        # --- rollout: num_steps in every environment; its noise follows from seed and iteration alone ---
+        start = time.perf_counter()
+        seed_all(args.seed, iteration)
+        if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
+            seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
+            next_obs, _ = envs.reset(seed=(seeds // 2 + 2**31).tolist(), options=rebuild)  # evaluation's lie below 2^31
+            next_obs = to_device(next_obs, device)
+        episode_sums, num_episodes = {}, torch.zeros((), device=device)
+        for step in range(args.num_steps):
+            for k, buffer in obs.items():
+                buffer[step] = next_obs[k]
+            with torch.no_grad():
+                actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
+            action = actions[step].clamp(low, high).nan_to_num()  # the simulator takes no NaN; the check below does
+            next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
+            next_obs, terminated, truncated = to_device(next_obs, device), terminated.to(device), truncated.to(device)
+            done = terminated | truncated
+            rewards[step] = reward.to(device) * args.reward_scale
+            dones[step] = done
+            if "final_observation" in infos:  # next_obs is the first of a new episode where done
+                with torch.no_grad():
+                    final_value = agent.get_value(to_device(infos["final_observation"], device))
+                next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
+                num_episodes += done.sum()
+                for key, value in infos["final_info"]["episode"].items():
+                    total = torch.where(done, value.to(device).float(), 0.0).sum()
+                    episode_sums[key] = episode_sums.get(key, 0.0) + total
+        with torch.no_grad():
+            following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
+        next_values = torch.where(dones.bool(), next_values, following)
+        advantages, returns = compute_gae(
+            rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
+        )
+
+        # --- check: what is not finite must not reach the weights; the host learns of it here, once for all steps ---
+        quantities = {"reward": rewards, "value": next_values} | {k: v for k, v in obs.items() if v.is_floating_point()}
+        broken = ~torch.stack([torch.isfinite(x).view(*shape, -1).all(-1).all(0) for x in quantities.values()])
+        problem = None
+        if broken.any():
+            names = [name for name, row in zip(quantities, broken) if row.any()]
+            env_idx = broken.any(0).nonzero().flatten()
+            problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
+            # scenes that are rebuilt now and then are so all at once
+            some = None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
+            next_obs = to_device(envs.reset(options=some)[0], device)
+        rollout_time = time.perf_counter() - start
+
+        # --- update: update_epochs times over the batch, in shuffled minibatches ---
+        torch.set_num_threads(num_cores())
+        if args.anneal_lr:
+            for group in optimizer.param_groups:
+                group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
+        b_obs = {k: v.flatten(0, 1) for k, v in obs.items()}
+        batch = [x.flatten(0, 1) for x in (actions, logprobs, advantages, returns, values)]
+        update_metrics = []
+        for _ in range(0 if problem else args.update_epochs):
+            permutation = torch.randperm(args.batch_size, device=device)
+            for i in range(args.num_minibatches):
+                mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
+                mb_obs = {k: v[mb_inds] for k, v in b_obs.items()}
+                if args.random_shift:
+                    mb_obs = random_shift(mb_obs, args.random_shift)
+                minibatch = [x[mb_inds] for x in batch]
+                update_metrics.append(update_minibatch(agent, optimizer, args, mb_obs, *minibatch))
+            if args.target_kl is not None:  # the host waits for this number once an epoch
+                if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
+                    break
+        if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
+            agent.update_normalization(b_obs)
+        torch.set_num_threads(1)
+        explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
+        global_step += args.batch_size
+
+        # --- log: here the host waits for the device ---
+        metrics = {}
+        if update_metrics:
+            metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
+            healthy = torch.stack([x.isfinite().all() for x in agent.state_dict().values()]).all()
+            if not (healthy and all(map(math.isfinite, metrics.values()))):
+                problem = "non-finite loss, gradient or normalisation"
+                agent.load_state_dict(snapshot["agent"])
+                optimizer.load_state_dict(copy.deepcopy(snapshot["optimizer"]))
+        if episode_sums:
+            means = torch.stack([*episode_sums.values()]) / num_episodes
+            metrics = dict(zip(episode_sums, means.tolist())) | metrics
+        elapsed = time.perf_counter() - start
+        metrics |= {
+            "iteration": iteration + 1,
+            "num_episodes": int(num_episodes),
+            "explained_variance": explained_variance.item(),
+            "learning_rate": optimizer.param_groups[0]["lr"],
+            "update_skipped": int(problem is not None),
+            "sps": args.batch_size / elapsed,
+            "rollout_time": rollout_time,
+            "update_time": elapsed - rollout_time,
+            "memory_mb": psutil.Process().memory_info().rss / 2**20,
+            "workers_memory_mb": workers_memory(envs) + workers_memory(eval_envs),
+        }
+        if device.type == "cuda":
+            free, total = torch.cuda.mem_get_info(device)
+            metrics["gpu_memory_mb"] = (total - free) / 2**20
+        attempt("metrics.jsonl", log, "train", metrics)
+        failures["update"] = failures["update"] + 1 if problem else 0
+        if problem:
+            bar.write(f"iteration {iteration + 1}: {problem}: no update")
+            if failures["update"] == MAX_FAILURES:
+                raise RunError(f"no update in {MAX_FAILURES} iterations in a row: {problem}")
+        status = ", ".join([f"{metrics['sps']:,.0f} steps/s", *summary(metrics)])
+        bar.set_postfix_str(status, refresh=False)
+        bar.update(args.batch_size)
+        if bar.disable and time.monotonic() - last_line > 10:  # no terminal
+            print(f"step {global_step:>9,}  training: {status}", flush=True)
+            last_line = time.monotonic()
+
+    if not finished:
+        return 128 + stopped_by
+    closing.close()
+    print(f"learning curve, videos and metrics are in {run_dir}")
+    if args.save_model:
+        print("to evaluate the best policy on other episodes:")
+        print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
+    return 0
+
+
+def main(argv: list[str]) -> int:
+    args = parse_args(argv)
+    check(args)
+    try:
+        with contextlib.ExitStack() as closing:
+            code = (evaluate_checkpoint if args.evaluate else train)(args, closing)
+    except RunError as error:
+        print(f"{SCRIPT.name}: {error}", file=sys.stderr)
+        code = 1
+    except KeyboardInterrupt:  # before the loop, which has a better way to stop
+        code = 130
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    last = find_run_dir(args) / "last.pt"
+    if code and last.exists() and not args.evaluate:
+        print(f"{last} is safe; to go on: python {sys.argv[0]} --resume {last.parent}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

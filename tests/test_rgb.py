@@ -1,0 +1,397 @@
+"""ppo_rgb.py: what it sees, what that takes, what it learns from. What it shares with ppo.py is tested there."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+
+import batched_env
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
+
+import ppo_rgb
+
+ARGS = ppo_rgb.Args(sim_backend="physx_cpu", capture_video=False, shader="minimal", num_envs=2, num_eval_envs=1)
+SMALL_IMAGES = ppo_rgb.Args(
+    env_id="Reach", sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
+    total_timesteps=16 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False, norm_obs=True,
+)  # fmt: skip
+ALL_TEXTURES = "rgb+depth+segmentation+position+normal+albedo"
+
+
+@pytest.fixture
+def train(in_tmp, monkeypatch, device):
+    """As conftest's, with images."""
+    monkeypatch.setattr(ppo_rgb, "make_envs", partial(batched_env.make_envs, device=device))
+    count = 0
+
+    def run(**flags):
+        nonlocal count
+        count += "resume" not in flags
+        args = replace(SMALL_IMAGES, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
+        with contextlib.ExitStack() as closing:
+            ppo_rgb.train(args, closing)
+        folder = ppo_rgb.find_run_dir(args)
+        return read_metrics(folder), ppo_rgb.load_checkpoint(folder / "last.pt")
+
+    return run
+
+
+# ----- what it sees ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    "env_id, obs_mode, flags",
+    [
+        ("MS-CartpoleBalance-v1", "rgb", {}),
+        ("MS-CartpoleBalance-v1", "depth", dict(include_state=False)),
+        ("MS-CartpoleBalance-v1", "segmentation", dict(frame_stack=3)),
+        ("MS-CartpoleBalance-v1", "rgb+segmentation", dict(camera_width=48, camera_height=40)),
+        ("MS-CartpoleBalance-v1", ALL_TEXTURES, dict(shader="default")),
+        ("PushCube-v1", "rgb+depth", dict(robot_uids="panda_wristcam", camera_width=40, camera_height=40)),
+    ],
+)
+def test_observations_are_maniskills(env_id, obs_mode, flags):
+    """Shapes, dtypes, values and the printed size against ManiSkill's own, for every texture and two cameras."""
+    args = replace(ARGS, env_id=env_id, obs_mode=obs_mode, **flags)
+    env = ppo_rgb.make_env(args, None, False)
+    sensors = dict(shader_pack=args.shader, width=args.camera_width or 128, height=args.camera_height or 128)
+    raw = gym.make(
+        env_id, obs_mode=obs_mode, sensor_configs=sensors, sim_backend="physx_cpu", reward_mode="normalized_dense",
+        control_mode="pd_joint_delta_pos", **(dict(robot_uids=args.robot_uids) if args.robot_uids else {}),
+    )  # fmt: skip
+    obs, _ = env.reset(seed=3)
+    expected, _ = raw.reset(seed=3)
+    for step in range(3):
+        cameras = list(expected["sensor_data"].values())
+        assert len(cameras) == 1 + (args.robot_uids is not None)
+        assert set(obs) == set(obs_mode.split("+")) | ({"state"} if args.include_state else set())
+        assert env.observation_space.contains({k: v.numpy() for k, v in obs.items()})
+        single = env.get_wrapper_attr("single_observation_space")
+        for k in obs_mode.split("+"):
+            images = torch.cat([camera[k] for camera in cameras], dim=-1)
+            if k == "segmentation":  # the default shader's 64 bits would be six too many bytes
+                images = images.short()
+            assert obs[k].dtype == images.dtype and single[k].shape == tuple(obs[k].shape[1:])
+            assert torch.equal(obs[k][..., -images.shape[-1] :], images), k
+            assert obs[k].shape[-1] == args.frame_stack * images.shape[-1]
+            assert images.float().std() > 0
+        if args.include_state:
+            flat = torch.cat([v.float().flatten(1) for part in ("agent", "extra") for v in expected[part].values()], 1)
+            assert torch.equal(obs["state"][:, -flat.shape[1] :], flat)
+        action = torch.full(env.action_space.shape, 0.5 * (-1) ** step)
+        obs, expected = env.step(action)[0], raw.step(action)[0]
+    args.num_steps = 7
+    found = []
+    with contextlib.redirect_stdout(None):
+        original = ppo_rgb.check_memory
+        try:
+            ppo_rgb.check_memory = lambda args, sizes: found.extend(sizes)
+            ppo_rgb.check_observations(args, ppo_rgb.REGISTERED_ENVS[env_id], [args.robot_uids])
+        finally:
+            ppo_rgb.check_memory = original
+    spaces = [space for k, space in single.items() if k != "state"]
+    needed = sum(7 * 2 * int(np.prod(space.shape)) * space.dtype.itemsize for space in spaces)
+    assert ppo_rgb.image_bytes(args, found) == needed
+    env.close()
+    raw.close()
+
+
+def test_cameras_of_every_task_are_known_without_building_it():
+    """Else nothing could be said of the memory before anything is built."""
+    for env_id, spec in ppo_rgb.REGISTERED_ENVS.items():
+        sizes = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(ppo_rgb, "check_memory", lambda args, found: sizes.extend(found))
+            patch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
+            obs_mode = "rgb+segmentation"  # of which some tasks have no other
+            ppo_rgb.check_observations(replace(ARGS, env_id=env_id, obs_mode=obs_mode, num_steps=1), spec, [])
+        assert sizes and all(h > 0 and w > 0 for h, w in sizes) or spec.cls._default_sensor_configs.fget(None) == []
+
+
+def test_frame_stack_with_partial_resets(device):
+    """Against one queue for each environment, filled with the first frame of its episode."""
+    args = replace(SMALL_IMAGES, obs_mode="rgb+segmentation", frame_stack=3)
+    env = ppo_rgb.ImageObservations(batched_env.BatchedReachImages(4, device), args)
+    plain = batched_env.BatchedReachImages(4, device)
+    queues = [None] * 4
+
+    def frames(raw, fresh=None):  # fresh: whose episodes a reset began; the others stay as they were
+        flat = {k: torch.cat([c[k] for c in raw["sensor_data"].values()], -1) for k in ("rgb", "segmentation")}
+        flat["state"] = raw["agent"]["position"]
+        for i in range(4):
+            frame = {k: v[i] for k, v in flat.items()}
+            if fresh is None:
+                queues[i] = queues[i][1:] + [frame]
+            elif i in fresh:
+                queues[i] = [frame] * 3
+        return {k: torch.stack([torch.cat([f[k] for f in queue], -1) for queue in queues]) for k in flat}
+
+    def same(ours, expected):
+        assert ours.keys() == expected.keys() and all(torch.equal(ours[k], expected[k]) for k in ours)
+
+    same(env.reset(seed=[1, 2, 3, 4])[0], frames(plain.reset(seed=[1, 2, 3, 4])[0], range(4)))
+    for step in range(8):
+        action = 0.5 * torch.sin(torch.arange(8.0) + step).view(4, 2).to(device)
+        obs = env.step(action)[0]
+        kept = {k: v.clone() for k, v in obs.items()}
+        same(obs, frames(plain.step(action)[0]))
+        if step in (3, 4, 6):
+            env_idx = torch.tensor([step % 4, 3 - step % 2], device=device).unique()
+            options, seeds = dict(env_idx=env_idx), list(range(10 + step, 10 + step + len(env_idx)))
+            after = env.reset(seed=seeds, options=options)[0]
+            same(after, frames(plain.reset(seed=seeds, options=options)[0], env_idx.tolist()))
+            same(obs, kept)
+    assert env.single_observation_space["rgb"].shape == (36, 36, 2 * 3 * 3)
+
+
+def test_textures_become_numbers_of_like_scale():
+    size = dict(rgb=3, depth=1, segmentation=1, position=3, normal=3, albedo=3)
+    spaces = gym.spaces.Dict({k: gym.spaces.Box(0, 1, (36, 36, c)) for k, c in size.items()})
+    encoder = ppo_rgb.Encoder(spaces, ARGS)
+    obs = {k: torch.zeros(1, 36, 36, c, dtype=torch.int16) for k, c in size.items()}
+    obs |= {k: obs[k].to(torch.uint8) for k in ("rgb", "albedo")} | {"normal": torch.full((1, 36, 36, 3), -1.0)}
+    obs["depth"][0, 0, :3, 0] = torch.tensor([0, 1000, 3000])
+    obs["rgb"][0, 0, 0] = 255
+    obs["position"][0, 0, 0] = torch.tensor([-2000, 0, 500])
+    obs["segmentation"][0, 0, :3, 0] = torch.tensor([7, 8, 7])
+    image = encoder.to_image(obs)
+    assert image.shape == (1, 3 + 1 + 3 + 3 + 3 + 3, 36, 36) and image.dtype == torch.float32
+    assert image[0, :3, 0, 0].tolist() == [0.5] * 3 and image[0, :3, 5, 5].tolist() == [-0.5] * 3
+    assert image[0, 3, 0, :3].tolist() == [0, 0.5, 0.25], "nothing is far away"
+    a, b, c = image[0, 4:7, 0, :3].T
+    assert torch.equal(a, c) and not torch.equal(a, b), "equal ids look alike, others not"
+    assert image[0, 7:10, 0, 0].tolist() == [-2, 0, 0.5]
+    assert (image[0, 10:13] == -1).all() and (image[0, 13:] == -0.5).all()
+
+
+@pytest.mark.parametrize("encoder", ["nature", "impala"])
+@pytest.mark.parametrize("include_state", [True, False])
+@pytest.mark.parametrize("channels_last", [True, False])
+def test_gradient_reaches_every_parameter(encoder, include_state, channels_last, device):
+    args = replace(
+        SMALL_IMAGES, obs_mode="rgb+depth+segmentation", encoder=encoder, include_state=include_state,
+        channels_last=channels_last,
+    )  # fmt: skip
+    envs = batched_env.make_envs(args, None, device=device)
+    agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    obs, _ = envs.reset(seed=list(range(16)))
+    assert set(obs) == {"rgb", "depth", "segmentation"} | ({"state"} if include_state else set())
+    action, logprob, entropy, value = agent.get_action_and_value(obs)
+    assert action.shape == (16, 2) and logprob.shape == entropy.shape == value.shape == (16,)
+    (logprob.sum() + entropy.sum() + value.sum()).backward()
+    for name, parameter in agent.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+    torch.testing.assert_close(agent.get_value(obs), value)
+    assert agent.get_action(obs).abs().max() < 0.2, "the initial policy is nearly the same everywhere"
+
+
+def test_memory_format_changes_speed_alone(device):
+    envs = batched_env.make_envs(SMALL_IMAGES, None, device=device)
+    obs, _ = envs.reset(seed=list(range(16)))
+    values = []
+    for channels_last in (False, True):
+        torch.manual_seed(0)
+        args = replace(SMALL_IMAGES, channels_last=channels_last)
+        agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+        values.append(agent.get_value(obs))
+    torch.testing.assert_close(*values, rtol=1e-4, atol=1e-5)
+
+
+def test_mixed_precision_is_near(device):
+    envs = batched_env.make_envs(SMALL_IMAGES, None, device=device)
+    obs, _ = envs.reset(seed=list(range(16)))
+    torch.manual_seed(0)
+    agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, SMALL_IMAGES).to(device)
+    exact = agent.get_value(obs)
+    agent.encoder.amp = True
+    value = agent.get_value(obs)
+    assert value.dtype == torch.float32 and not torch.equal(value, exact)
+    torch.testing.assert_close(value, exact, rtol=0.05, atol=0.05)
+
+
+def test_random_shift(device):
+    """Against padding by hand: each image moves as a whole, all textures together, borders repeated."""
+    torch.manual_seed(0)
+    rgb = torch.randint(0, 255, (50, 9, 11, 3), dtype=torch.uint8, device=device)
+    obs = {"state": torch.randn(50, 2, device=device), "rgb": rgb, "depth": rgb[..., :1].short()}
+    out = ppo_rgb.random_shift(obs, 2)
+    assert out["state"] is obs["state"] and out["rgb"].dtype == torch.uint8
+    seen = set()
+    for before, after, depth in zip(rgb.cpu().numpy(), out["rgb"].cpu().numpy(), out["depth"].cpu().numpy()):
+        padded = np.pad(before, ((2, 2), (2, 2), (0, 0)), mode="edge")
+        shifts = [(y, x) for y in range(5) for x in range(5) if (padded[y : y + 9, x : x + 11] == after).all()]
+        assert len(shifts) == 1 and (depth[..., 0] == after[..., 0]).all()
+        seen.update(shifts)
+    assert len(seen) > 15
+    assert all(torch.equal(a, b) for a, b in zip(ppo_rgb.random_shift(obs, 0).values(), obs.values()))
+
+
+# ----- training on torch-native environments --------------------------------------------------------------------------
+
+
+def test_all_options_train(train):
+    for flags in (
+        dict(obs_mode="rgb+depth+segmentation", frame_stack=2, random_shift=2),
+        dict(encoder="impala", include_state=False, channels_last=False),
+        dict(obs_mode="depth", amp=True),
+    ):
+        metrics, checkpoint = train(total_timesteps=320, **flags)
+        assert [row["global_step"] for row in metrics if row["kind"] == "eval"] == [0, 320]
+        assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
+        assert not any(row.get("update_skipped") for row in metrics)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_learns_from_images(train, seed):
+    """The goal is on the images alone."""
+    flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
+    metrics, _ = train(seed=seed, num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
+    first, last = [row for row in metrics if row["kind"] == "eval"]
+    assert first["success_once"] < 0.5 and last["success_once"] >= 0.9
+
+
+def test_exact_resume_is_bit_identical(train, monkeypatch):
+    flags = dict(exact_resume=True, checkpoint_freq=2, obs_mode="rgb+segmentation", frame_stack=2, random_shift=2)
+    metrics, uninterrupted = train(**flags)
+    calls, update = [], ppo_rgb.update_minibatch
+
+    def crash(*args):
+        calls.append(1)
+        if len(calls) == 16 * 2 + 16 + 5:  # in the fourth iteration
+            raise ZeroDivisionError
+        return update(*args)
+
+    monkeypatch.setattr(ppo_rgb, "update_minibatch", crash)
+    with pytest.raises(ZeroDivisionError):
+        train(**flags)
+    again, resumed = train(**flags, resume="runs/run2/last.pt")
+    assert same_weights(uninterrupted, resumed)
+    timeless = lambda rows: [{k: v for k, v in row.items() if not k.endswith(("time", "sps", "_mb"))} for row in rows]
+    assert timeless(metrics) == timeless(again)
+
+
+def test_non_finite_state_skips_one_update(train, monkeypatch, capsys):
+    observe, count = batched_env.BatchedReachImages.observe, 0
+
+    def broken(self):
+        nonlocal count
+        obs = observe(self)
+        count += self.num_envs == 16
+        if count == 15 and self.num_envs == 16:
+            obs["agent"]["position"][3] = float("nan")
+        return obs
+
+    monkeypatch.setattr(batched_env.BatchedReachImages, "observe", broken)
+    metrics, checkpoint = train()
+    assert sum(row.get("update_skipped", 0) for row in metrics) == 1
+    assert "state" in capsys.readouterr().out
+    assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
+
+
+MEASURE = """
+import contextlib, resource, sys
+sys.path[:0] = [{root!r}, {root!r} + "/tests"]
+import batched_env, ppo_rgb, test_rgb
+from dataclasses import replace
+ppo_rgb.make_envs = batched_env.make_envs
+args = replace(test_rgb.SMALL_IMAGES, exp_name="memory", num_steps=int(sys.argv[1]), num_envs=64, num_minibatches=500,
+               total_timesteps=64 * int(sys.argv[1]), update_epochs=1, obs_mode="rgb+depth")
+with contextlib.ExitStack() as closing, contextlib.redirect_stdout(sys.stderr):
+    ppo_rgb.train(args, closing)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, ppo_rgb.image_bytes(args, [(36, 36)] * 2))
+"""
+
+
+@pytest.mark.slow
+def test_the_buffers_take_what_is_said_and_are_not_copied(tmp_path):
+    """Peak memory of runs with a short and a long rollout."""
+    peaks, sizes = [], []
+    for num_steps in (10, 400):
+        (tmp_path / str(num_steps)).mkdir()
+        process = subprocess.run(
+            [sys.executable, "-c", MEASURE.format(root=str(ROOT)), str(num_steps)],
+            cwd=tmp_path / str(num_steps), capture_output=True, text=True,
+        )  # fmt: skip
+        assert process.returncode == 0, process.stderr[-2000:]
+        peak, size = map(int, process.stdout.split())
+        peaks.append(peak)
+        sizes.append(size)
+    assert sizes[1] > 300 * 2**20
+    assert (peaks[1] - peaks[0]) / (sizes[1] - sizes[0]) == pytest.approx(1, abs=0.2)
+
+
+# ----- as a command ---------------------------------------------------------------------------------------------------
+
+TINY = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--num_envs", 2,
+        "--num_eval_envs", 1, "--num_eval_episodes", 1, "--num_steps", 10, "--total_timesteps", 40,
+        "--num_minibatches", 2,
+        "--env_kwargs", '{"max_episode_steps": 8, "sensor_configs": {"fov": 0.6}}', "--no-cuda")  # fmt: skip
+SCRIPT = ROOT / "ppo_rgb.py"
+
+
+@pytest.mark.render
+def test_train_resume_evaluate_and_film(tmp_path):
+    run = tmp_path / "runs/tiny"
+    process = run_script(
+        *TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 1, cwd=tmp_path, script=SCRIPT
+    )
+    assert process.returncode == 0 and process.stderr == "", process.stderr
+    assert "images of a rollout (40x40, 10 steps of 2 environments)" in process.stdout
+    process = run_script("--resume", run, "--total_timesteps", 60, cwd=tmp_path, script=SCRIPT)
+    assert process.returncode == 0 and process.stderr == "", process.stderr
+    rows = read_metrics(run)
+    assert [row["global_step"] for row in rows if row["kind"] == "train"] == [20, 40, 60]
+    assert [row["global_step"] for row in rows if row["kind"] == "eval"] == [0, 20, 40, 60]
+    videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))
+    assert videos == [f"step_{step:09d}.mp4" for step in (0, 20, 40, 60)]
+    import imageio.v3 as iio
+
+    images = iio.imread(run / "videos" / videos[-1])
+    assert len(images) >= 8 and images.shape[1:] == (512, 768, 3), "the scene, and two views of half its height"
+    scene, rgb, depth = images[:, :, :512], images[:, :256, 512:], images[:, 256:, 512:]
+    assert all(part.std() > 3 for part in (scene, rgb, depth))
+    # evaluation needs the checkpoint alone: the cameras are its own
+    (tmp_path / "elsewhere").mkdir()
+    process = run_script("--evaluate", "--checkpoint", run / "best.pt", cwd=tmp_path / "elsewhere", script=SCRIPT)
+    assert process.returncode == 0, process.stderr
+    assert json.loads((run / "eval.json").read_text())["episode_len"] == 8
+    assert (run / "test_videos/seed_0.mp4").exists()
+
+
+def test_without_vulkan_it_says_what_to_install(tmp_path):
+    process = run_script(*TINY, cwd=tmp_path, env=NO_VULKAN, script=SCRIPT)
+    assert process.returncode == 2 and process.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
+    assert (
+        process.stderr.startswith("ppo_rgb.py: there is no Vulkan device") and "mesa-vulkan-drivers" in process.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ("--obs_mode state", "rgb, depth, segmentation"),
+        ("--obs_mode rgb+thermal", "rgb, depth, segmentation"),
+        ("--obs_mode rgb+rgb", "rgb, depth, segmentation"),
+        ("--obs_mode normal --shader minimal", "--shader default"),
+        ("--render_backend none", "ppo.py"),
+        ("--camera_width 20", "camera_width"),
+        ("--frame_stack 0", "frame_stack"),
+        ("--num_envs 1000000 --num_steps 100 --total_timesteps 1000000000", "try --num_steps"),
+        ("--env_id PutCarrotOnPlateInScene-v1", "rgb+segmentation"),
+    ],
+)
+def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
+    monkeypatch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
+    with pytest.raises(SystemExit) as exit:
+        ppo_rgb.main(["--no-cuda", *arguments.split()])
+    output = capsys.readouterr().err
+    assert exit.value.code == 2 and output.count("\n") == 1 and message in output, output
+    assert not list(in_tmp.iterdir())
