@@ -1,6 +1,10 @@
+import os
+
+# several processes share the cores: threads that wait by spinning would take them from each other
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import contextlib
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -9,6 +13,8 @@ from functools import partial
 from pathlib import Path
 
 import batched_env
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -58,6 +64,10 @@ SMALL = ppo.Args(
 )  # fmt: skip
 
 
+def box(size):
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
 def read_metrics(folder):
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
@@ -93,8 +103,8 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own
     process = run_script(
-        "--exp-name", "small", "--num_envs", "4", "--num-eval-envs", "2", "--num_eval_episodes", "3",
-        "--num-steps", "20", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
+        "--exp-name", "small", "--num_envs", "2", "--num-eval-envs", "2", "--num_eval_episodes", "3",
+        "--num-steps", "40", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
         "--no-capture_video", "--no-cuda",
         cwd=folder, script=folder / "ppo.py",
     )  # fmt: skip

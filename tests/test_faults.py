@@ -395,7 +395,7 @@ def test_resume_refuses_other_flags_but_those_that_may_change(trained, in_tmp, c
         assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
     args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --save_freq 7 --track".split())
     assert (args.total_timesteps, args.eval_freq, args.save_freq, args.track) == (1000, 3, 7, True)
-    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 8, 1)
+    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (2, 40, 8, 1)
     assert ppo.find_run_dir(args) == Path("runs/x")
 
 

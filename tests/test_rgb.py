@@ -148,7 +148,7 @@ def test_frame_stack_with_partial_resets(device):
             after = env.reset(seed=seeds, options=options)[0]
             same(after, frames(plain.reset(seed=seeds, options=options)[0], env_idx.tolist()))
             same(obs, kept)
-    assert env.single_observation_space["rgb"].shape == (36, 36, 2 * 3 * 3)
+    assert env.get_wrapper_attr("single_observation_space")["rgb"].shape == (36, 36, 2 * 3 * 3)
 
 
 def test_textures_become_numbers_of_like_scale():
@@ -330,8 +330,8 @@ def test_the_buffers_take_what_is_said_and_are_not_copied(tmp_path):
 
 # ----- as a command ---------------------------------------------------------------------------------------------------
 
-TINY = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--num_envs", 2,
-        "--num_eval_envs", 1, "--num_eval_episodes", 1, "--num_steps", 10, "--total_timesteps", 40,
+TINY = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--num_envs", 1,
+        "--num_eval_envs", 1, "--num_eval_episodes", 1, "--num_steps", 20, "--total_timesteps", 40,
         "--num_minibatches", 2,
         "--env_kwargs", '{"max_episode_steps": 8, "sensor_configs": {"fov": 0.6}}', "--no-cuda")  # fmt: skip
 SCRIPT = ROOT / "ppo_rgb.py"
@@ -344,7 +344,7 @@ def test_train_resume_evaluate_and_film(tmp_path):
         *TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 1, cwd=tmp_path, script=SCRIPT
     )
     assert process.returncode == 0 and process.stderr == "", process.stderr
-    assert "images of a rollout (40x40, 10 steps of 2 environments)" in process.stdout
+    assert "images of a rollout (40x40, 20 steps of 1 environments)" in process.stdout
     process = run_script("--resume", run, "--total_timesteps", 60, cwd=tmp_path, script=SCRIPT)
     assert process.returncode == 0 and process.stderr == "", process.stderr
     rows = read_metrics(run)
@@ -360,7 +360,8 @@ def test_train_resume_evaluate_and_film(tmp_path):
     assert all(part.std() > 3 for part in (scene, rgb, depth))
     # evaluation needs the checkpoint alone: the cameras are its own
     (tmp_path / "elsewhere").mkdir()
-    process = run_script("--evaluate", "--checkpoint", run / "best.pt", cwd=tmp_path / "elsewhere", script=SCRIPT)
+    flags = ("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 1, "--num_eval_envs", 1)
+    process = run_script(*flags, cwd=tmp_path / "elsewhere", script=SCRIPT)
     assert process.returncode == 0, process.stderr
     assert json.loads((run / "eval.json").read_text())["episode_len"] == 8
     assert (run / "test_videos/seed_0.mp4").exists()

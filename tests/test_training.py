@@ -6,7 +6,7 @@ from dataclasses import replace
 import batched_env
 import pytest
 import torch
-from conftest import SMALL, same_weights
+from conftest import SMALL, box, same_weights
 
 import ppo
 
@@ -45,7 +45,7 @@ def test_same_seed_same_weights_other_seed_others(train):
 def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
     """The same episodes from any number of environments, a last round that is not full included."""
     torch.manual_seed(0)
-    agent = ppo.Agent(4, 2, SMALL).to(device)
+    agent = ppo.Agent(box(4), box(2), SMALL).to(device)
     agent.actor_mean.weight.data *= 100
     results = []
     for num_envs in (1, 5, 16):
@@ -61,7 +61,7 @@ def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
 
 def test_evaluation_with_early_ends(train, device):
     """eval_partial_reset: an episode counts up to its first end."""
-    agent = ppo.Agent(4, 2, SMALL).to(device)
+    agent = ppo.Agent(box(4), box(2), SMALL).to(device)
     agent.get_action = lambda obs: ((obs[:, 2:] - obs[:, :2]) / 0.3).clamp(-1, 1)  # straight to the goal
     envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), None, True, device)
     result = ppo.evaluate(agent, envs, 16, 0, 20, device)
@@ -130,7 +130,7 @@ def test_separate_learning_rates(train):
     _, a, _ = train(critic_learning_rate=0.0, total_timesteps=320)
     _, b, _ = train(total_timesteps=320)
     ppo.seed_all(SMALL.seed)
-    fresh = ppo.Agent(4, 2, SMALL).state_dict()
+    fresh = ppo.Agent(box(4), box(2), SMALL).state_dict()
     for key in fresh:
         critic = key.startswith("critic")
         assert torch.equal(a["agent"][key].cpu(), fresh[key]) == (critic or key.startswith("obs_")), key

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from conftest import box
 
 import ppo
 
@@ -12,7 +13,7 @@ OBS, ACT, ROWS = 5, 3, 40
 def make(**flags):
     torch.manual_seed(0)
     args = ppo.Args(learning_rate=1e-2, **flags)
-    agent = ppo.Agent(OBS, ACT, args).double()
+    agent = ppo.Agent(box(OBS), box(ACT), args).double()
     with torch.no_grad():
         agent.actor_mean.weight *= 50  # far from the initial, nearly constant policy
         agent.actor_logstd += 0.1 * torch.randn(1, ACT)
@@ -116,7 +117,7 @@ def test_running_normalization_equals_statistics_of_all_data():
 
 def test_initial_policy_is_nearly_zero_and_deterministic_action_is_its_mean():
     torch.manual_seed(0)
-    agent = ppo.Agent(OBS, ACT, ppo.Args())
+    agent = ppo.Agent(box(OBS), box(ACT), ppo.Args())
     obs = torch.randn(64, OBS)
     assert agent.get_action(obs).abs().max() < 0.1
     torch.manual_seed(0)
