@@ -119,7 +119,7 @@ mani_skill.logger.addFilter(lambda record: not re.match(NOISE, record.getMessage
 class Args:
     # --- experiment ---
     exp_name: Optional[str] = None
-    """name of the run, whose files go to runs/<exp_name> (None: <env_id>__ppo__<seed>__<time>)"""
+    """name of the run, whose files go to runs/<exp_name> (None: <env_id>__<script>__<seed>__<time>)"""
     seed: int = 1
     """seed of the weights, the actions and the training episodes"""
     torch_deterministic: bool = True
@@ -217,7 +217,7 @@ class Args:
     finite_horizon_gae: bool = False
     """lambda-weighted mean over the n-step returns that exist, instead of the infinite sum"""
     encoder: Literal["nature", "impala"] = "nature"
-    """network on the images: NatureCNN, or the residual one of IMPALA, which is slower and sees finer things"""
+    """network on the images: NatureCNN, or the residual one of IMPALA, which is slower"""
     random_shift: int = 0
     """in updates, shift each image by up to so many pixels at random (DrQ takes 4)"""
     channels_last: bool = True
@@ -440,6 +440,15 @@ class ImageObservations(FlattenRGBDObservationWrapper):
         return torch.cat([scene, column.permute(0, 2, 3, 1)], dim=2)
 
 
+class Recorder(RecordEpisode):
+    def flush_video(self, *args, **kwargs):
+        try:
+            super().flush_video(*args, **kwargs)
+        except OSError as error:  # such as a full disk
+            print(f"a video could not be written, the run goes on: {error}", flush=True)
+            self.render_images, self._video_steps = [], 0
+
+
 def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
     """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
     `index` tells it from the others and only the first is filmed."""
@@ -471,7 +480,7 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
                 return base_env._episode_seed[0] < args.eval_seed + rounds_filmed * args.num_eval_envs
             return step // args.num_steps % args.save_train_video_freq == 0
 
-        env = RecordEpisode(
+        env = Recorder(
             env,
             output_dir=str(record_dir),
             save_video=video,

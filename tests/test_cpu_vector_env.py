@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import ppo
+import ppo_rgb
 
 ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=3, capture_video=False)
 SEEDS = [7, 2**31 + 5, 123]
@@ -41,21 +42,31 @@ def play(envs, seeds, actions, before_reset=lambda seeds: None):
     return steps
 
 
+STATE = (ppo, ARGS)
+IMAGES = ppo_rgb.Args(
+    sim_backend="physx_cpu", num_envs=3, capture_video=False, obs_mode="rgb+segmentation", frame_stack=2,
+    camera_width=40, camera_height=40, shader="minimal",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "env_id, partial_reset",
+    "script, env_id, partial_reset",
     [
-        ("PushCube-v1", True),
-        ("PushCube-v1", False),
-        ("PickCube-v1", True),
-        ("MS-CartpoleBalance-v1", True),
-        ("RollBall-v1", True),
+        (STATE, "PushCube-v1", True),
+        (STATE, "PushCube-v1", False),
+        (STATE, "PickCube-v1", True),
+        (STATE, "MS-CartpoleBalance-v1", True),
+        (STATE, "RollBall-v1", True),
+        pytest.param((ppo_rgb, IMAGES), "MS-CartpoleBalance-v1", True, marks=pytest.mark.render),
     ],
 )
-def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
+def test_equals_maniskill_vector_env(script, env_id, partial_reset, tmp_path):
     """Episodes end by success or failure at different times, and by the time limit; then the environments reset
     themselves from their own random streams."""
-    args = replace(ARGS, env_id=env_id, partial_reset=partial_reset, env_kwargs='{"max_episode_steps": 15}')
-    envs = ppo.make_envs(args, tmp_path)
+    script, args = script
+    args = replace(args, env_id=env_id, partial_reset=partial_reset, env_kwargs='{"max_episode_steps": 15}')
+    state = "obs" if script is ppo else "obs.state"
+    envs = script.make_envs(args, tmp_path)
     try:
         actions = torch.rand(70, 3, *envs.single_action_space.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
         if env_id == "MS-CartpoleBalance-v1":
@@ -65,8 +76,8 @@ def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
         envs.close()
     ended_at, first_observations = set(), []
     for i, seed in enumerate(SEEDS):
-        single = ppo.make_envs(replace(args, num_envs=1), tmp_path)
-        assert not isinstance(single.base_env, ppo.CPUVectorEnv)
+        single = script.make_envs(replace(args, num_envs=1), tmp_path)
+        assert not isinstance(single.base_env, script.CPUVectorEnv)
         # the pool's environments continue from a random stream of their own, which their seed determines
         stream = lambda seeds: torch.manual_seed(ppo.stream_seed(seeds[0]))
         alone = play(single, [seed], actions[:, i : i + 1], before_reset=stream)
@@ -76,9 +87,9 @@ def test_equals_maniskill_vector_env(env_id, partial_reset, tmp_path):
             if ended:
                 ended_at.add((i, t))
                 assert theirs.keys() == ours.keys()
-                assert not torch.equal(ours["info.final_observation"][i], ours["obs"][i])
+                assert not torch.equal(ours["info.final_" + state.replace("obs", "observation")][i], ours[state][i])
             if ended or t == 0:
-                first_observations.append(ours["obs"][i])
+                first_observations.append(ours[state][i])
             # where another environment of the pool ended, it also has final_... entries of this one
             for key in theirs.keys() if ended or "info._final_info" not in ours else theirs.keys() & ours.keys():
                 assert torch.equal(theirs[key][0], ours[key][i]), (i, t, key)
