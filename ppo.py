@@ -342,7 +342,7 @@ def parse_args(argv: list[str]) -> Args:
         stored = load_checkpoint(args.checkpoint)["args"]
         of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
         kept = stored.keys() - of_this_evaluation if args.evaluate else OF_THE_NETWORK
-    args = parse(argv, replace(default, **{k: stored[k] for k in kept if hasattr(default, k)}))
+    args = parse(argv, replace(default, **{k: stored[k] for k in kept if k in stored and hasattr(default, k)}))
     if args.resume is not None:
         for k in kept - MAY_CHANGE:
             if hasattr(args, k) and getattr(args, k) != stored[k]:
@@ -709,7 +709,7 @@ def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSki
 # ----- Agent ----------------------------------------------------------------------------------------------------------
 
 
-def layer_init(layer: nn.Linear, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Linear:
+def layer_init(layer: nn.Module, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Module:
     nn.init.orthogonal_(layer.weight, std)
     nn.init.constant_(layer.bias, bias_const)
     return layer
@@ -1201,7 +1201,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir, device = find_run_dir(args), choose_device(args)
-    given = asdict(args)  # a resumed run may find the renderer that this one lacks
+    given = asdict(args)  # before videos are switched off: a resumed run may find the renderer that this one lacks
     prepare_rendering(args)
     resumed = load_checkpoint(args.resume) if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)

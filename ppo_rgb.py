@@ -89,6 +89,7 @@ MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
 from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.sensors.camera import parse_camera_configs, update_camera_configs_from_dict
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
@@ -299,7 +300,7 @@ OF_THE_NETWORK = (
 )  # fmt: skip
 MAY_CHANGE = OF_THE_MACHINE | {
     "total_timesteps", "stop_at_success", "eval_freq", "save_model", "save_freq", "checkpoint_freq",
-    "checkpoint_minutes", "save_train_video_freq", "render_mode", "channels_last", "wandb_project_name", "wandb_entity",
+    "checkpoint_minutes", "save_train_video_freq", "render_mode", "wandb_project_name", "wandb_entity",
     "wandb_group", "torch_deterministic", "compile", "cudagraphs", "resume",
 }  # fmt: skip
 
@@ -347,7 +348,7 @@ def parse_args(argv: list[str]) -> Args:
         stored = load_checkpoint(args.checkpoint)["args"]
         of_this_evaluation = OF_THE_MACHINE | {"num_eval_episodes", "num_eval_steps", "eval_seed", "exp_name", "resume"}
         kept = stored.keys() - of_this_evaluation if args.evaluate else OF_THE_NETWORK
-    args = parse(argv, replace(default, **{k: stored[k] for k in kept if hasattr(default, k)}))
+    args = parse(argv, replace(default, **{k: stored[k] for k in kept if k in stored and hasattr(default, k)}))
     if args.resume is not None:
         for k in kept - MAY_CHANGE:
             if hasattr(args, k) and getattr(args, k) != stored[k]:
@@ -395,13 +396,14 @@ def default_reward_mode(task) -> str:
 class ImageObservations(FlattenRGBDObservationWrapper):
     """Observations as a dict: if included "state", float32 (num_envs, state_dim), and each texture of `obs_mode`, all
     cameras together as channels: (num_envs, height, width, channels), in the dtype in which it was rendered (uint8
-    colours, int16 millimetres and ids). ManiSkill's wrapper knows colours and depth; this one adds the other textures,
-    the last `frame_stack` frames as further channels, where ManiSkill's knows no partial resets, and the view."""
+    colours, int16 millimetres and ids, float32 normals). ManiSkill's wrapper knows colours and depth; this one adds the
+    other textures, the last `frame_stack` frames as further channels, where ManiSkill's knows no partial resets, and
+    the view."""
 
     def __init__(self, env: gym.Env, args: Args):
         textures = args.obs_mode.split("+")
         self.others = [k for k in textures if k not in ("rgb", "depth")]
-        self.num_frames, self.frames = args.frame_stack, {}
+        self.num_frames, self.frames, self.latest = args.frame_stack, {}, {}
         super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
 
     def observation(self, observation: dict, new_episodes=None) -> dict:
@@ -410,8 +412,10 @@ class ImageObservations(FlattenRGBDObservationWrapper):
         latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
         if "segmentation" in latest:
             latest["segmentation"] = latest["segmentation"].short()  # of which some shaders make 64 bits
+        # CPU simulation may be rendered by a GPU, and the observation of GPU simulation that tells the space is a copy
+        latest = self.latest = {k: v.to(self.base_env.device) for k, v in latest.items()}
         if self.num_frames == 1:
-            return latest
+            return dict(latest)
         for k, frame in latest.items():
             filled = torch.cat([frame] * self.num_frames, dim=-1)  # an episode begins with its first frame repeated
             if new_episodes is not None and k in self.frames:
@@ -428,16 +432,36 @@ class ImageObservations(FlattenRGBDObservationWrapper):
         return self.observation(obs, (options or {}).get("env_idx", everyone)), info
 
     def render(self) -> torch.Tensor:
-        """The scene, and in a column beside it what the policy sees: uint8 (num_envs, height, width, 3)."""
-        if self.base_env.render_mode != "all":
-            return self.env.render()
-        scene = self.base_env.render_rgb_array()
-        views = [view for camera in self.base_env.get_sensor_images().values() for view in camera.values()]
-        height = scene.shape[1] // max(2, len(views))
-        views = [F.interpolate(v.permute(0, 3, 1, 2), size=(height, height * v.shape[2] // v.shape[1])) for v in views]
-        column = torch.cat([F.pad(v, (0, max(x.shape[3] for x in views) - v.shape[3])) for v in views], dim=2)
-        column = F.pad(column, (0, 0, 0, scene.shape[1] - column.shape[2]))
-        return torch.cat([scene, column.permute(0, 2, 3, 1)], dim=2)
+        """The scene, what the policy sees, or both, as render_mode asks: uint8 (num_envs, height, width, 3)."""
+        mode = self.base_env.render_mode
+        scene = None if mode == "sensors" else self.base_env.render_rgb_array()
+        if mode == "rgb_array":
+            return scene
+        views = []
+        for k, texture in self.latest.items():
+            for x in texture.split(TEXTURES.get(k, 1), dim=-1) if k != "state" else ():  # of each camera
+                if k == "depth":
+                    x = 255 * (x > 0) / (1 + x / 1000)
+                elif k == "segmentation":
+                    x = x.int() * torch.tensor([37, 91, 151], device=x.device) % 256
+                elif k == "position":
+                    x = 128 + x / 1000 * 64
+                elif k == "normal":
+                    x = (x + 1) * 127.5
+                views.append(x.clamp(0, 255).to(torch.uint8).expand(*x.shape[:-1], 3).permute(0, 3, 1, 2))
+        height = views[0].shape[2] if scene is None else scene.shape[1] // max(2, len(views))
+        views = [F.interpolate(v, size=(height, height * v.shape[3] // v.shape[2])) for v in views]
+        column = torch.cat(views, dim=2).permute(0, 2, 3, 1)
+        if scene is None:  # not asked for, or a task without a camera for people
+            return column
+        column = F.pad(column, (0, 0, 0, 0, 0, scene.shape[1] - column.shape[1]))
+        return torch.cat([scene.to(column.device), column], dim=2)
+
+
+def sensor_configs(args: Args) -> dict:
+    """What gym.make is told of the cameras."""
+    flags = dict(width=args.camera_width, height=args.camera_height, shader_pack=args.shader)
+    return {k: v for k, v in flags.items() if v is not None} | json.loads(args.env_kwargs).get("sensor_configs", {})
 
 
 class Recorder(RecordEpisode):
@@ -454,8 +478,6 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
     `index` tells it from the others and only the first is filmed."""
     video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
     trajectory = evaluation and args.save_trajectory
-    further = json.loads(args.env_kwargs)
-    sensors = dict(width=args.camera_width, height=args.camera_height, shader_pack=args.shader)
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
@@ -466,9 +488,9 @@ def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num
         sim_backend=args.sim_backend,
         render_backend=args.render_backend,
         render_mode=args.render_mode if video else None,
-        sensor_configs={k: v for k, v in sensors.items() if v is not None} | further.pop("sensor_configs", {}),
     )
-    env = gym.make(args.env_id, **{k: v for k, v in kwargs.items() if v is not None}, **further)
+    kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
+    env = gym.make(args.env_id, **kwargs | {"sensor_configs": sensor_configs(args)})
     env = ImageObservations(env, args)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = FlattenActionSpaceWrapper(env)
@@ -764,7 +786,7 @@ def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSki
 # ----- Agent ----------------------------------------------------------------------------------------------------------
 
 
-def layer_init(layer: nn.Linear, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Linear:
+def layer_init(layer: nn.Module, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Module:
     nn.init.orthogonal_(layer.weight, std)
     nn.init.constant_(layer.bias, bias_const)
     return layer
@@ -820,7 +842,8 @@ class Encoder(nn.Module):
     def to_image(self, obs: dict) -> torch.Tensor:
         """All textures as channels of one float32 image (batch, channels, height, width), of comparable scale."""
         images = []
-        for k, x in obs.items():
+        for k in [k for k in TEXTURES if k in obs]:  # in this order, whatever the dict's
+            x = obs[k]
             if k in ("rgb", "albedo"):
                 images.append(x.float() / 255 - 0.5)
             elif k == "depth":  # nearness: 1 at the camera, 1/2 at one metre, 0 where there is nothing
@@ -829,7 +852,7 @@ class Encoder(nn.Module):
                 images.append(x.float() / 1000)
             elif k == "segmentation":  # ids are names, not quantities
                 images.append(self.segment_embedding(x.long() % 256).flatten(-2))
-            elif k == "normal":
+            else:
                 images.append(x)
         image = torch.cat(images, dim=-1).permute(0, 3, 1, 2)  # which is channels-last already
         return image if self.channels_last else image.contiguous()
@@ -1152,7 +1175,7 @@ LIMITS = (  # of numbers that are given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_steps num_minibatches update_epochs num_eval_episodes num_eval_steps "
               "total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1, 32, "frame_stack"),
-    (36, 4096, "camera_width camera_height"),  # NatureCNN's convolutions need 36 pixels
+    (8, 4096, "camera_width camera_height"),
     (0, 32, "random_shift"),
     (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
     (0, 1e18, "seed critic_learning_rate ent_coef vf_coef target_kl eval_freq eval_seed reconfiguration_freq "
@@ -1275,9 +1298,28 @@ def check(args: Args) -> None:
 
 def image_bytes(args: Args, camera_sizes: list[tuple[int, int]]) -> int:
     """What the images of a rollout take, for cameras of these (height, width)."""
-    channels = [TEXTURES[k] * {"rgb": 1, "albedo": 1, "normal": 4}.get(k, 2) for k in args.obs_mode.split("+")]
-    pixels = sum((args.camera_height or height) * (args.camera_width or width) for height, width in camera_sizes)
-    return args.num_steps * args.num_envs * args.frame_stack * pixels * sum(channels)
+    channels = sum(TEXTURES[k] * {"rgb": 1, "albedo": 1, "normal": 4}.get(k, 2) for k in args.obs_mode.split("+"))
+    pixels = sum(height * width for height, width in camera_sizes)
+    return args.num_steps * args.num_envs * args.frame_stack * pixels * channels
+
+
+def find_cameras(args: Args, spec, robots: list) -> Optional[list[tuple[int, int]]]:
+    """(height, width) of the cameras of a task and its robot without building them, on which they rarely depend; None
+    where they do."""
+    try:
+        task = MagicMock(robot_uids=robots[0] if len(robots) == 1 else tuple(robots))
+        cameras = {}
+        with patch("mani_skill.utils.sapien_utils.look_at", return_value=sapien.Pose()):
+            cameras |= parse_camera_configs(spec.cls._default_sensor_configs.fget(task))
+            for robot in robots:
+                if robot in REGISTERED_AGENTS:
+                    cameras |= parse_camera_configs(
+                        REGISTERED_AGENTS[robot].agent_cls._sensor_configs.fget(MagicMock())
+                    )
+        update_camera_configs_from_dict(cameras, sensor_configs(args))
+        return [(int(camera.height), int(camera.width)) for camera in cameras.values()]
+    except Exception:
+        return None
 
 
 def check_observations(args: Args, spec, robots: list) -> None:
@@ -1293,28 +1335,30 @@ def check_observations(args: Args, spec, robots: list) -> None:
     if args.shader == "minimal" and {"normal", "albedo"} & set(textures):
         fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
     on_gpu = args.sim_backend != "physx_cpu"
+    if on_gpu and args.shader.startswith("rt"):
+        fail(f"--shader {args.shader}: ray tracing needs CPU simulation: --sim_backend physx_cpu")
     if args.render_backend == "none":
         fail("--render_backend none: images must be rendered; to learn from the state: ppo.py")
     if RENDER_DEVICE is None or on_gpu and not RENDER_DEVICE.is_cuda():
         fail(f"there is no Vulkan device to render images: {how_to_render(on_gpu)}, and see examples/check_machine.py; "
              "to learn from the state: ppo.py")  # fmt: skip
+    if not isinstance(json.loads(args.env_kwargs).get("sensor_configs", {}), dict):
+        fail('--env_kwargs: sensor_configs must be an object like {"fov": 0.6}')
 
-    # the cameras without the task: they rarely depend on anything that is built
-    configs = []
-    agents = [REGISTERED_AGENTS[robot].agent_cls for robot in robots if robot in REGISTERED_AGENTS]
-    for cls, name in [(spec.cls, "_default_sensor_configs"), *((cls, "_sensor_configs") for cls in agents)]:
-        with contextlib.suppress(Exception), patch("mani_skill.utils.sapien_utils.look_at", return_value=sapien.Pose()):
-            found = getattr(cls, name).fget(MagicMock())
-            configs += found if isinstance(found, list) else [found]
-    check_memory(args, [(config.height, config.width) for config in configs])
-
-
-def check_memory(args: Args, camera_sizes: list[tuple[int, int]]) -> None:
-    device, needed = choose_device(args), image_bytes(args, camera_sizes)
-    if args.evaluate or not needed:
+    cameras = find_cameras(args, spec, robots)
+    if cameras is None:
         return
+    sizes = ", ".join(f"{width}x{height}" for height, width in cameras)
+    if not cameras:
+        fail(f"--env_id {args.env_id}: neither the task nor its robot has a camera; to learn from the state: ppo.py")
+    if len(set(cameras)) > 1:
+        fail(f"the cameras' sizes differ ({sizes}): give --camera_width and --camera_height")
+    if args.encoder == "nature" and min(cameras[0]) < 36:
+        fail(f"images of {sizes}: NatureCNN needs 36 pixels each way: use larger ones or --encoder impala")
+    if args.evaluate:
+        return
+    device, needed = choose_device(args), image_bytes(args, cameras)
     free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
-    sizes = ", ".join(f"{args.camera_width or w}x{args.camera_height or h}" for h, w in camera_sizes)
     print(f"images of a rollout ({sizes}, {args.num_steps} steps of {args.num_envs} environments): "
           f"{needed / 2**20:,.1f} MiB of {free / 2**20:,.0f} free")  # fmt: skip
     if needed > 0.9 * free:
@@ -1385,7 +1429,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir, device = find_run_dir(args), choose_device(args)
-    given = asdict(args)  # a resumed run may find the renderer that this one lacks
+    given = asdict(args)
     prepare_rendering(args)
     resumed = load_checkpoint(args.resume) if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)

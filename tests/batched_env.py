@@ -61,7 +61,8 @@ class BatchedReachImages(BatchedReach):
 
     def __init__(self, num_envs, device):
         super().__init__(num_envs, device)
-        self.update_obs_space(self.observe())
+        on_cpu = lambda tree: {k: on_cpu(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.cpu()
+        self.update_obs_space(on_cpu(self.observe()))  # as ManiSkill keeps its first observation
 
     def update_obs_space(self, obs):
         self._init_raw_obs = obs

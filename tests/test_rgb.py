@@ -88,14 +88,7 @@ def test_observations_are_maniskills(env_id, obs_mode, flags):
         action = torch.full(env.action_space.shape, 0.5 * (-1) ** step)
         obs, expected = env.step(action)[0], raw.step(action)[0]
     args.num_steps = 7
-    found = []
-    with contextlib.redirect_stdout(None):
-        original = ppo_rgb.check_memory
-        try:
-            ppo_rgb.check_memory = lambda args, sizes: found.extend(sizes)
-            ppo_rgb.check_observations(args, ppo_rgb.REGISTERED_ENVS[env_id], [args.robot_uids])
-        finally:
-            ppo_rgb.check_memory = original
+    found = ppo_rgb.find_cameras(args, ppo_rgb.REGISTERED_ENVS[env_id], [args.robot_uids])
     spaces = [space for k, space in single.items() if k != "state"]
     needed = sum(7 * 2 * int(np.prod(space.shape)) * space.dtype.itemsize for space in spaces)
     assert ppo_rgb.image_bytes(args, found) == needed
@@ -105,14 +98,44 @@ def test_observations_are_maniskills(env_id, obs_mode, flags):
 
 def test_cameras_of_every_task_are_known_without_building_it():
     """Else nothing could be said of the memory before anything is built."""
+    without = set()
     for env_id, spec in ppo_rgb.REGISTERED_ENVS.items():
-        sizes = []
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(ppo_rgb, "check_memory", lambda args, found: sizes.extend(found))
-            patch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
-            obs_mode = "rgb+segmentation"  # of which some tasks have no other
-            ppo_rgb.check_observations(replace(ARGS, env_id=env_id, obs_mode=obs_mode, num_steps=1), spec, [])
-        assert sizes and all(h > 0 and w > 0 for h, w in sizes) or spec.cls._default_sensor_configs.fget(None) == []
+        sizes = ppo_rgb.find_cameras(replace(ARGS, env_id=env_id), spec, [None])
+        assert all(h > 0 and w > 0 for h, w in sizes), env_id
+        if not sizes:
+            without.add(env_id)
+    assert without >= {"UnitreeG1Stand-v1", "UnitreeH1Stand-v1"} and len(without) < 10
+    spec = ppo_rgb.REGISTERED_ENVS["TwoRobotPickCube-v1"]
+    wrists = ppo_rgb.find_cameras(ARGS, spec, ["panda_wristcam", "panda_wristcam"])
+    assert len(wrists) == 2, "the task's, and the robots', which share a name"
+    smaller = replace(ARGS, camera_width=50, env_kwargs='{"sensor_configs": {"base_camera": {"height": 60}}}')
+    assert ppo_rgb.find_cameras(smaller, ppo_rgb.REGISTERED_ENVS["PushCube-v1"], ["panda_wristcam"]) == [
+        (60, 50),
+        (128, 50),
+    ]
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("render_mode", ["all", "sensors", "rgb_array"])
+def test_view(render_mode):
+    """Every texture can be filmed, beside the scene or without one."""
+    args = replace(
+        ARGS, env_id="MS-CartpoleBalance-v1", obs_mode=ALL_TEXTURES, shader="default", camera_width=40,
+        camera_height=40, capture_video=True, render_mode=render_mode, frame_stack=2,
+    )  # fmt: skip
+    env = ppo_rgb.make_env(args, "unused", True).env  # without the recorder
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    image = env.render()
+    width = {"all": 512 + 85, "sensors": 40, "rgb_array": 512}[render_mode]
+    height = 6 * 40 if render_mode == "sensors" else 512
+    assert image.dtype == torch.uint8 and image.shape == (1, height, width, 3)
+    if render_mode == "sensors":
+        assert all(view.float().std() > 0 for view in image[0].split(40))
+        env.unwrapped.render_rgb_array = lambda: None  # a task without a camera for people
+        env.unwrapped.render_mode = "all"
+        assert torch.equal(env.render(), image)
+    env.close()
 
 
 def test_frame_stack_with_partial_resets(device):
@@ -165,6 +188,7 @@ def test_textures_become_numbers_of_like_scale():
     assert image.shape == (1, 3 + 1 + 3 + 3 + 3 + 3, 36, 36) and image.dtype == torch.float32
     assert image[0, :3, 0, 0].tolist() == [0.5] * 3 and image[0, :3, 5, 5].tolist() == [-0.5] * 3
     assert image[0, 3, 0, :3].tolist() == [0, 0.5, 0.25], "nothing is far away"
+    assert torch.equal(encoder.to_image(dict(reversed(obs.items()))), image), "whatever the order of the dict"
     a, b, c = image[0, 4:7, 0, :3].T
     assert torch.equal(a, c) and not torch.equal(a, b), "equal ids look alike, others not"
     assert image[0, 7:10, 0, 0].tolist() == [-2, 0, 0.5]
@@ -251,7 +275,7 @@ def test_all_options_train(train):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_learns_from_images(train, seed):
-    """The goal is on the images alone, where a pixel is as wide as the goal: the mean action often stops just beside."""
+    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just beside it."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
     metrics, _ = train(seed=seed, num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
@@ -383,8 +407,12 @@ def test_without_vulkan_it_says_what_to_install(tmp_path):
         ("--obs_mode rgb+rgb", "rgb, depth, segmentation"),
         ("--obs_mode normal --shader minimal", "--shader default"),
         ("--render_backend none", "ppo.py"),
-        ("--camera_width 20", "camera_width"),
+        ("--camera_width 20", "36 pixels"),
         ("--frame_stack 0", "frame_stack"),
+        ("--env_id UnitreeG1Stand-v1", "ppo.py"),
+        ("--robot_uids xlerobot", "--camera_width"),
+        ('--env_kwargs {"sensor_configs":[64]}', "sensor_configs"),
+        ('--env_kwargs {"sensor_configs":{"width":20}}', "36 pixels"),
         ("--num_envs 1000000 --num_steps 100 --total_timesteps 1000000000", "try --num_steps"),
         ("--env_id PutCarrotOnPlateInScene-v1", "rgb+segmentation"),
     ],

@@ -10,6 +10,10 @@ import ppo_rgb
 
 # what differs between the state and the images; everything else must not
 DIFFERENT = {"Args", "make_env", "Agent", "check_observations", "prepare_rendering", "train"}
+DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "OF_THE_NETWORK", "MAY_CHANGE", "LIMITS"}
+DIFFERENT_HELP = {
+    "obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs", "eval_freq", "num_eval_episodes"
+}  # fmt: skip
 MOST_DIFFERENT_LINES_OF_TRAIN = 30
 
 
@@ -30,19 +34,25 @@ def test_inline_metadata_equals_pyproject():
         assert script == {k: project[k] for k in ("requires-python", "dependencies")}
 
 
-def definitions(name):
-    """Source of each function and class of a script, comments included."""
+def definitions(name, kinds=(ast.FunctionDef, ast.ClassDef)):
+    """Source of what a script defines at its top level, comments and decorators included."""
     source = (ROOT / name).read_text()
-    nodes = [node for node in ast.parse(source).body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
-    return {node.name: ast.get_source_segment(source, node) for node in nodes}
+    found = {}
+    for node in ast.parse(source).body:
+        if isinstance(node, kinds):
+            key = ast.unparse(node.targets[0]) if isinstance(node, ast.Assign) else node.name
+            first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", ()))])
+            found[key] = "\n".join(source.splitlines()[first - 1 : node.end_lineno])
+    return found
 
 
 def test_shared_definitions_are_identical():
     state, images = definitions("ppo.py"), definitions("ppo_rgb.py")
     shared = state.keys() & images.keys()
     assert {name for name in shared if state[name] != images[name]} == DIFFERENT
-    assert state.keys() - images.keys() == set(), "InertRenderObject is not at the top level"
-    assert [name for name in images if name in shared] == list(state), "in the same order"
+    assert list(state) == [name for name in images if name in shared], "all of them, in the same order"
+    state, images = definitions("ppo.py", ast.Assign), definitions("ppo_rgb.py", ast.Assign)
+    assert {name for name in state if state[name] != images.get(name)} == DIFFERENT_CONSTANTS
 
 
 def test_the_loops_differ_by_the_observations_alone():
@@ -51,14 +61,24 @@ def test_the_loops_differ_by_the_observations_alone():
     assert len(changed) <= MOST_DIFFERENT_LINES_OF_TRAIN, "\n".join(changed)
 
 
-def test_flags_that_both_have_are_the_same():
-    """Types and help, but for what a CPU or an image changes; and in the same order."""
-    import ppo
+def flags(name):
+    """(type, default, help) of each flag of a script."""
+    (tree,) = [node for node in ast.parse((ROOT / name).read_text()).body if getattr(node, "name", "") == "Args"]
+    return {
+        field.target.id: (ast.unparse(field.annotation), ast.unparse(field.value), text.value.value)
+        for field, text in zip(tree.body, tree.body[1:])
+        if isinstance(field, ast.AnnAssign)
+    }
 
-    a, b = ppo.Args.__dataclass_fields__, ppo_rgb.Args.__dataclass_fields__
-    assert [k for k in a if k in b] == [k for k in b if k in a]
+
+def test_flags_that_both_have_are_the_same():
+    """And in the same order, but for what images change."""
+    a, b = flags("ppo.py"), flags("ppo_rgb.py")
+    assert [k for k in a if k in b] == [k for k in b if k in a] and b.keys() == ppo_rgb.Args.__dataclass_fields__.keys()
     assert a.keys() - b.keys() == {"shared_features"}
     of_images = "include_state frame_stack camera_width camera_height encoder random_shift channels_last amp"
     assert b.keys() - a.keys() == set(of_images.split())
-    other_defaults = {k for k in a.keys() & b.keys() if a[k].default != b[k].default}
-    assert other_defaults == {"obs_mode", "num_envs", "render_mode", "shader"}
+    shared = a.keys() & b.keys()
+    assert {k for k in shared if a[k][0] != b[k][0]} == {"obs_mode", "shader"}
+    assert {k for k in shared if a[k][1] != b[k][1]} == {"obs_mode", "num_envs", "render_mode", "shader"}
+    assert {k for k in shared if a[k][2] != b[k][2]} == DIFFERENT_HELP

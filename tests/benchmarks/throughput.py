@@ -12,6 +12,7 @@ policy and one for value), minibatch size, epochs and batch, and no target KL th
 """
 
 import argparse
+import contextlib
 import os
 import platform
 import statistics
@@ -50,7 +51,8 @@ class Ours:
                 )  # fmt: skip
                 stdout, sys.stdout = sys.stdout, open(os.devnull, "w")
                 try:
-                    ppo.train(args)
+                    with contextlib.ExitStack() as closing:
+                        ppo.train(args, closing)
                 finally:
                     sys.stdout = stdout
                 lines = Path("runs/x/metrics.jsonl").read_text().splitlines()
