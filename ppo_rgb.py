@@ -451,11 +451,11 @@ class ImageObservations(FlattenRGBDObservationWrapper):
                 views.append(x.clamp(0, 255).to(torch.uint8).expand(*x.shape[:-1], 3).permute(0, 3, 1, 2))
         height = views[0].shape[2] if scene is None else scene.shape[1] // max(2, len(views))
         views = [F.interpolate(v, size=(height, height * v.shape[3] // v.shape[2])) for v in views]
-        column = torch.cat(views, dim=2).permute(0, 2, 3, 1)
-        if scene is None:  # not asked for, or a task without a camera for people
-            return column
-        column = F.pad(column, (0, 0, 0, 0, 0, scene.shape[1] - column.shape[1]))
-        return torch.cat([scene.to(column.device), column], dim=2)
+        image = torch.cat(views, dim=2).permute(0, 2, 3, 1)
+        if scene is not None:  # it was asked for, and the task has a camera for people
+            column = F.pad(image, (0, 0, 0, 0, 0, scene.shape[1] - image.shape[1]))
+            image = torch.cat([scene.to(column.device), column], dim=2)
+        return F.pad(image, (0, 0, 0, -image.shape[2] % 16, 0, -image.shape[1] % 16))  # videos are made of such blocks
 
 
 def sensor_configs(args: Args) -> dict:
