@@ -35,7 +35,7 @@ def main():
         steps, minutes, values = zip(*points)
         args = json.loads((run / "args.json").read_text())["args"]
         for axis, x in ((by_steps, steps), (by_minutes, minutes)):
-            axis.plot(x, values, marker="o", markersize=3, label=f"seed {args['seed']}")
+            axis.plot(x, values, marker="o", markersize=3, label=run.name)
     by_steps.set(xlabel="environment steps", ylabel=f"{options.metric}, evaluation")
     by_minutes.set(xlabel="minutes of training (rollout and update)")
     by_minutes.legend(loc="lower right")
