@@ -1389,7 +1389,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                     final_value = agent.get_value(to_device(infos["final_observation"], device))
                 next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
                 num_episodes += done.sum()
-                for key, value in infos["final_info"]["episode"].items():
+                final, known = infos["final_info"], ("elapsed_steps", "success", "fail")
+                own = {k: v for k, v in final.items() if getattr(v, "ndim", 0) == 1 and k not in known}  # is_grasped, …
+                for key, value in (own | final["episode"]).items():
                     total = torch.where(done, value.to(device).float(), 0.0).sum()
                     episode_sums[key] = episode_sums.get(key, 0.0) + total
         with torch.no_grad():

@@ -439,7 +439,7 @@ class ImageObservations(FlattenRGBDObservationWrapper):
             return scene
         views = []
         for k, texture in self.latest.items():
-            for x in texture.split(TEXTURES.get(k, 1), dim=-1) if k != "state" else ():  # of each camera
+            for x in () if k == "state" else texture.split(TEXTURES[k], dim=-1):  # of each camera
                 if k == "depth":
                     x = 255 * (x > 0) / (1 + x / 1000)
                 elif k == "segmentation":
@@ -820,13 +820,12 @@ class Encoder(nn.Module):
         self.segment_embedding = nn.Embedding(256, 3) if "segmentation" in obs_space.spaces else None
         example = self.to_image({k: torch.zeros(1, *v.shape) for k, v in obs_space.items()})
         channels = example.shape[1]
+        layers = []
         if args.encoder == "nature":
-            layers = []
             for width, kernel, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
                 layers += [layer_init(nn.Conv2d(channels, width, kernel, stride)), nn.ReLU()]
                 channels = width
         else:
-            layers = []
             for width in (16, 32, 32):
                 layers += [nn.Conv2d(channels, width, 3, padding=1), nn.MaxPool2d(3, stride=2, padding=1)]
                 layers += [ResidualBlock(width), ResidualBlock(width)]
@@ -892,27 +891,24 @@ class Agent(nn.Module):
         self.register_buffer("obs_var", torch.ones(state_dim))
         self.register_buffer("obs_count", torch.tensor(1e-4))
 
-    def features(self, obs):
-        features = self.encoder(obs)
-        if not self.obs_mean.numel():
-            return features
-        state = obs["state"]
-        if self.norm_obs:
-            state = ((state - self.obs_mean) * torch.rsqrt(self.obs_var + 1e-5)).clamp(-10, 10)
-        return torch.cat([features, state], dim=1)
+    def normalize(self, obs):
+        if not self.norm_obs:
+            return obs
+        return ((obs - self.obs_mean) * torch.rsqrt(self.obs_var + 1e-5)).clamp(-10, 10)
 
     @torch.no_grad()
     def update_normalization(self, obs):
-        """Merge the mean and variance of a batch of states into the running ones (Chan et al. 1979)."""
-        if not self.obs_mean.numel():
-            return
-        state = obs["state"]
-        count = self.obs_count + len(state)
-        delta = state.mean(0) - self.obs_mean
-        m2 = self.obs_var * self.obs_count + state.var(0, correction=0) * len(state)
-        self.obs_var.copy_((m2 + delta**2 * self.obs_count * len(state) / count) / count)
-        self.obs_mean.add_(delta * len(state) / count)
+        """Merge the mean and variance of a batch of observations into the running ones (Chan et al. 1979)."""
+        count = self.obs_count + len(obs)
+        delta = obs.mean(0) - self.obs_mean
+        m2 = self.obs_var * self.obs_count + obs.var(0, correction=0) * len(obs)
+        self.obs_var.copy_((m2 + delta**2 * self.obs_count * len(obs) / count) / count)
+        self.obs_mean.add_(delta * len(obs) / count)
         self.obs_count.copy_(count)
+
+    def features(self, obs):
+        features = self.encoder(obs)
+        return torch.cat([features, self.normalize(obs["state"])], dim=1) if "state" in obs else features
 
     def get_value(self, obs):
         return self.critic(self.features(obs)).squeeze(-1)
@@ -1330,9 +1326,10 @@ def check_observations(args: Args, spec, robots: list) -> None:
     modes = spec.cls.SUPPORTED_OBS_MODES
     if args.obs_mode not in modes and "any_textures" not in modes:
         fail(f"--obs_mode {args.obs_mode}: {args.env_id} has {', '.join(modes)}")
+    beyond_minimal = {"normal", "albedo"} & set(textures)
     if args.shader is None:
-        args.shader = "default" if {"normal", "albedo"} & set(textures) else "minimal"
-    if args.shader == "minimal" and {"normal", "albedo"} & set(textures):
+        args.shader = "default" if beyond_minimal else "minimal"
+    if args.shader == "minimal" and beyond_minimal:
         fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
     on_gpu = args.sim_backend != "physx_cpu"
     if on_gpu and args.shader.startswith("rt"):
@@ -1621,7 +1618,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                     final_value = agent.get_value(to_device(infos["final_observation"], device))
                 next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
                 num_episodes += done.sum()
-                for key, value in infos["final_info"]["episode"].items():
+                final, known = infos["final_info"], ("elapsed_steps", "success", "fail")
+                own = {k: v for k, v in final.items() if getattr(v, "ndim", 0) == 1 and k not in known}  # is_grasped, …
+                for key, value in (own | final["episode"]).items():
                     total = torch.where(done, value.to(device).float(), 0.0).sum()
                     episode_sums[key] = episode_sums.get(key, 0.0) + total
         with torch.no_grad():
@@ -1665,7 +1664,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                 if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
                     break
         if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
-            agent.update_normalization(b_obs)
+            if "state" in b_obs:
+                agent.update_normalization(b_obs["state"])
         torch.set_num_threads(1)
         explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
         global_step += args.batch_size

@@ -4,6 +4,7 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import contextlib
+import fcntl
 import json
 import shutil
 import subprocess
@@ -35,6 +36,10 @@ def run_script(*arguments, cwd, env=None, script=ROOT / "ppo.py", timeout=600):
         text=True,
         timeout=timeout,
     )
+
+
+def pytest_addoption(parser):
+    parser.addoption("--env_id", action="append", help="task that tests/test_task.py looks at (may be repeated)")
 
 
 def pytest_runtest_setup(item):
@@ -73,22 +78,34 @@ def read_metrics(folder):
 
 
 @pytest.fixture
-def train(in_tmp, monkeypatch, device):
+def script():
+    """The script that `train` and `in_update` work with; tests of the other one override it, and `small`."""
+    return ppo
+
+
+@pytest.fixture
+def small():
+    return SMALL
+
+
+@pytest.fixture
+def train(in_tmp, monkeypatch, device, script, small):
     """Train in this process on the torch-native environments, with the flags given; the runs are called run1, run2, …
     Returns the metrics, the last checkpoint and the exit code."""
-    monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device=device))
+    monkeypatch.setattr(script, "make_envs", partial(batched_env.make_envs, device=device))
+    monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # which takes longer than these runs
     count = 0
 
     def run(**flags):
         nonlocal count
         count += "resume" not in flags
         if "resume" in flags:
-            flags["resume"] = str(ppo.find_checkpoint(flags["resume"]))
-        args = replace(SMALL, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
+            flags["resume"] = str(script.find_checkpoint(flags["resume"]))
+        args = replace(small, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
         with contextlib.ExitStack() as closing:
-            code = ppo.train(args, closing)
-        folder = ppo.find_run_dir(args)
-        return read_metrics(folder), ppo.load_checkpoint(folder / "last.pt"), code
+            code = script.train(args, closing)
+        folder = script.find_run_dir(args)
+        return read_metrics(folder), script.load_checkpoint(folder / "last.pt"), code
 
     return run
 
@@ -97,16 +114,93 @@ def same_weights(a, b):
     return all(torch.equal(a["agent"][k], b["agent"][k]) for k in a["agent"])
 
 
+WALL_CLOCK = {"time", "sps", "rollout_time", "update_time", "memory_mb", "workers_memory_mb", "gpu_memory_mb"}
+
+
+def without_clock(rows):
+    return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]
+
+
+def scalars(folder):
+    """What TensorBoard would show: {tag: [(step, value), ...]}"""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    tags = [tag for tag in events.Tags()["scalars"] if tag.split("/")[1] not in WALL_CLOCK]
+    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
+
+
+def same_run(a, b):
+    """Weights, optimizer, metrics and TensorBoard of two run folders are equal, wall-clock fields aside."""
+    for name in ("last.pt", "best.pt"):
+        x, y = ppo.load_checkpoint(a / name), ppo.load_checkpoint(b / name)
+        assert same_weights(x, y) and x["global_step"] == y["global_step"]
+        for s, t in zip(x["optimizer"]["state"].values(), y["optimizer"]["state"].values(), strict=True):
+            assert all(torch.equal(s[k], t[k]) for k in s)
+    assert without_clock(read_metrics(a)) == without_clock(read_metrics(b))
+    assert scalars(a) == scalars(b)
+    return True
+
+
+@pytest.fixture
+def in_update(monkeypatch, script):
+    """Do something in the middle of the update of one iteration, once; its result, if any, stands for the metrics."""
+
+    def arrange(iteration, action, per_iteration=8):
+        update, calls = script.update_minibatch, []
+
+        def counting(*args):
+            calls.append(1)
+            if len(calls) == per_iteration * iteration + 3:
+                action()
+            return update(*args)
+
+        monkeypatch.setattr(script, "update_minibatch", counting)
+
+    return arrange
+
+
+class Stop(Exception):
+    pass
+
+
+def crash():
+    raise Stop
+
+
+def refused(arguments, capsys, script=ppo):
+    """The one line with which the script refuses these arguments; fails unless it refuses them as it should."""
+    before = sorted(Path().rglob("*"))
+    with pytest.raises(SystemExit) as exit:
+        script.main([*map(str, arguments)])
+    output = capsys.readouterr()
+    assert exit.value.code == 2, arguments
+    assert (
+        output.err.count("\n") == 1
+        and output.err.startswith(f"{script.SCRIPT.name}: ")
+        and "Traceback" not in output.err
+    )
+    assert sorted(Path().rglob("*")) == before, "nothing is written"
+    return output.err
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A short run on the CPU pool, made once: its folder."""
-    folder = tmp_path_factory.mktemp("trained")
-    shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own
-    process = run_script(
-        "--exp-name", "small", "--num_envs", "2", "--num-eval-envs", "2", "--num_eval_episodes", "3",
-        "--num-steps", "40", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
-        "--no-capture_video", "--no-cuda",
-        cwd=folder, script=folder / "ppo.py",
-    )  # fmt: skip
-    assert process.returncode == 0, process.stderr
-    return folder / "runs/small", process
+    """A short run on the CPU pool, made once: its folder, and what it printed."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
+    folder.mkdir(exist_ok=True)
+    with open(folder / "lock", "w") as lock:  # for the first of pytest's processes to make it
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "output.json").exists():
+            shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own
+            process = run_script(
+                "--exp-name", "small", "--num_envs", "2", "--num-eval-envs", "2", "--num_eval_episodes", "3",
+                "--num-steps", "40", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
+                "--no-capture_video", "--no-cuda",
+                cwd=folder, script=folder / "ppo.py",
+            )  # fmt: skip
+            assert process.returncode == 0, process.stderr
+            (folder / "output.json").write_text(json.dumps([process.stdout, process.stderr]))
+    return folder / "runs/small", *json.loads((folder / "output.json").read_text())

@@ -19,7 +19,7 @@ TINY = ("--num_envs", 1, "--num_eval_envs", 1, "--num_eval_episodes", 2, "--num_
 
 
 def test_run_folder(trained):
-    folder, process = trained
+    folder, output, errors = trained
     rows = read_metrics(folder)
     train_rows = [row for row in rows if row["kind"] == "train"]
     evaluations = [row for row in rows if row["kind"] == "eval"]
@@ -38,15 +38,14 @@ def test_run_folder(trained):
     assert list(folder.glob("events.out.tfevents.*"))
     names = {"best.pt", "last.pt", "iteration_2.pt", "iteration_4.pt"}
     assert {path.name for path in folder.glob("*.pt")} == names and not (folder / "videos").exists()
-    assert "Traceback" not in process.stdout + process.stderr
-    assert process.stderr == "", "without a terminal there is no bar, and no warning concerns the user"
-    assert process.stdout.count("evaluation:") == 4 and "runs/small" in process.stdout
+    assert errors == "", "without a terminal there is no bar, and no warning concerns the user"
+    assert output.count("evaluation:") == 4 and "runs/small" in output
 
 
 def test_tensorboard_holds_the_same_numbers(trained):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    folder, _ = trained
+    folder, *_ = trained
     events = EventAccumulator(str(folder))
     events.Reload()
     rows = read_metrics(folder)
@@ -57,8 +56,8 @@ def test_tensorboard_holds_the_same_numbers(trained):
         assert [v for _, v in logged] == pytest.approx([v for _, v in expected])
 
 
-def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path):
-    folder, _ = trained
+def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch):
+    folder, *_ = trained
     command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video")
     process = run_script(*command, "--num_eval_episodes", 5, "--eval-seed", 100, cwd=tmp_path)
     assert process.returncode == 0, process.stderr
@@ -69,8 +68,8 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path):
         assert low <= results[key] <= high and f"{results[key]:.3f}" in process.stdout
     assert not list(tmp_path.iterdir()), "nothing is written but beside the checkpoint"
     # the last evaluation of the training run, once more; PhysX remembers contacts of the episodes before
-    process = run_script(*command, "--num_eval_episodes", 3, "--num_eval_envs", 1, cwd=tmp_path)
-    assert process.returncode == 0, process.stderr
+    monkeypatch.chdir(tmp_path)
+    assert ppo.main([*map(str, command), "--num_eval_episodes", "3", "--num_eval_envs", "1"]) == 0
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     results = json.loads((folder / "eval.json").read_text())
     assert {k: results[k] for k in ("return", "success_once")} == pytest.approx(
@@ -152,16 +151,23 @@ def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1"])
-def test_other_kinds_of_task(env_id, tmp_path):
+def test_other_kinds_of_task(tmp_path):
     """Dict action spaces, tasks without success, other robots, sparse reward: built and trained without Vulkan."""
-    process = run_script(
-        *TINY, "--env_id", env_id, "--env_kwargs", '{"max_episode_steps": 10}', cwd=tmp_path, env=NO_VULKAN
-    )
+    env_ids = ("TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1")
+    flags = [*map(str, TINY), "--env_kwargs", '{"max_episode_steps": 10}']
+    (tmp_path / "all.py").write_text(f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+import ppo
+if __name__ == "__main__":
+    assert not any(ppo.main([*{flags!r}, "--env_id", x, "--exp_name", x]) for x in {env_ids!r})
+""")
+    process = run_script(cwd=tmp_path, env=NO_VULKAN, script=tmp_path / "all.py")
     assert process.returncode == 0, process.stderr
-    rows = read_metrics(tmp_path / "runs/tiny")
-    assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
-    assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
+    for env_id in env_ids:
+        rows = read_metrics(tmp_path / "runs" / env_id)
+        assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
+        assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
 
 
 def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
@@ -211,13 +217,13 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
 
 
 @pytest.mark.slow
-def test_weights_do_not_depend_on_evaluation_with_the_pool(tmp_path):
+def test_weights_do_not_depend_on_evaluation_with_the_pool(in_tmp):
     """The same through real tasks: training in the pool, evaluation in the process, where it could disturb."""
     for freq in (1, 0):
-        flags = (*TINY, "--num_envs", 4, "--total_timesteps", 160, "--exp-name", freq, "--eval_freq", freq)
-        process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
-        assert process.returncode == 0, process.stderr
-    a, b = [ppo.load_checkpoint(tmp_path / f"runs/{freq}/last.pt") for freq in (1, 0)]
+        flags = (*TINY, "--num_envs", 4, "--total_timesteps", 160, "--exp-name", freq, "--eval_freq", freq,
+                 "--num_eval_episodes", 1, "--env_kwargs", '{"max_episode_steps": 15}')  # fmt: skip
+        assert ppo.main([*map(str, flags), "--no-capture_video"]) == 0
+    a, b = [ppo.load_checkpoint(f"runs/{freq}/last.pt") for freq in (1, 0)]
     assert same_weights(a, b)
 
 
@@ -231,12 +237,12 @@ def frames(path):
 def test_videos_and_trajectories(tmp_path):
     process = run_script(
         *TINY, "--env_kwargs", '{"max_episode_steps": 8}', "--save_trajectory", "--save_train_video_freq", 1,
-        "--eval_freq", 1, "--num_eval_envs", 2, cwd=tmp_path,
+        "--num_eval_envs", 2, cwd=tmp_path,
     )  # fmt: skip
     assert process.returncode == 0 and process.stderr == "", process.stderr
     run = tmp_path / "runs/tiny"
     videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))
-    assert videos == ["step_000000000.mp4", "step_000000020.mp4", "step_000000040.mp4"]
+    assert videos == ["step_000000000.mp4", "step_000000040.mp4"]
     assert list((run / "train_videos").glob("*.mp4"))
     images = frames(run / "videos" / videos[0])
     assert 8 <= len(images) <= 10 and images.std() > 10, "a filmed scene is not of one colour"
@@ -244,10 +250,10 @@ def test_videos_and_trajectories(tmp_path):
     files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
     assert files == [f"trajectory_{i}.{suffix}" for i in range(2) for suffix in ("h5", "json")]
     episodes = json.loads((run / "videos/trajectory_1.json").read_text())["episodes"]
-    assert [(e["elapsed_steps"], e["episode_seed"]) for e in episodes] == [(8, 1)] * 3
+    assert [(e["elapsed_steps"], e["episode_seed"]) for e in episodes] == [(8, 1)] * 2
     replay = subprocess.run(
         [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", run / "videos/trajectory_1.h5",
-         "--sim-backend", "physx_cpu", "--save-traj", "--allow-failure", "--count", "2"],
+         "--sim-backend", "physx_cpu", "--save-traj", "--allow-failure", "--count", "1"],
         capture_output=True, text=True, stdin=subprocess.DEVNULL, cwd=tmp_path,
     )  # fmt: skip
     assert replay.returncode == 0, replay.stderr[-2000:]
@@ -269,12 +275,11 @@ def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_the_main_job(tmp_path):
-    """With no flag but the seed and, for time's sake, two fifths of the steps at most: trains, ends by itself, and
-    learns the task."""
-    flags = ("--seed", 1, "--exp-name", "main", "--no-cuda", "--total_timesteps", 100_000, "--stop_at_success", 0.8)
-    process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN, timeout=1200)
+def test_learns_a_task_of_maniskill(tmp_path):
+    """In the pool, as a user would; a task that is cheap to simulate."""
+    flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 16_000,
+             "--eval_freq", 0, "--num_eval_episodes", 4, "--exp-name", "x", "--no-cuda")  # fmt: skip
+    process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
     assert process.returncode == 0, process.stderr
-    rows = read_metrics(tmp_path / "runs/main")
-    evaluations = [row["success_once"] for row in rows if row["kind"] == "eval"]
-    assert evaluations[0] < 0.2 and evaluations[-1] >= 0.6
+    first, last = [row["return"] for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "eval"]
+    assert first < 150 and last > 500, "of 1,000"

@@ -8,20 +8,9 @@ from pathlib import Path
 import batched_env
 import pytest
 import torch
+from conftest import refused
 
 import ppo
-
-
-def refused(arguments, capsys):
-    """The one line with which the script refuses these arguments; fails unless it refuses them as it should."""
-    before = sorted(Path().rglob("*"))
-    with pytest.raises(SystemExit) as exit:
-        ppo.main([*map(str, arguments)])
-    output = capsys.readouterr()
-    assert exit.value.code == 2, arguments
-    assert output.err.count("\n") == 1 and output.err.startswith("ppo.py: ") and "Traceback" not in output.err
-    assert sorted(Path().rglob("*")) == before, "nothing is written"
-    return output.err
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,16 @@
 """ppo_rgb.py: what it sees, what that takes, what it learns from. What it shares with ppo.py is tested there."""
 
-import contextlib
 import json
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 
 import batched_env
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_script, same_run
 
 import ppo_rgb
 
@@ -25,21 +23,13 @@ ALL_TEXTURES = "rgb+depth+segmentation+position+normal+albedo"
 
 
 @pytest.fixture
-def train(in_tmp, monkeypatch, device):
-    """As conftest's, with images."""
-    monkeypatch.setattr(ppo_rgb, "make_envs", partial(batched_env.make_envs, device=device))
-    count = 0
+def script():
+    return ppo_rgb
 
-    def run(**flags):
-        nonlocal count
-        count += "resume" not in flags
-        args = replace(SMALL_IMAGES, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
-        with contextlib.ExitStack() as closing:
-            ppo_rgb.train(args, closing)
-        folder = ppo_rgb.find_run_dir(args)
-        return read_metrics(folder), ppo_rgb.load_checkpoint(folder / "last.pt")
 
-    return run
+@pytest.fixture
+def small():
+    return SMALL_IMAGES
 
 
 # ----- what it sees ---------------------------------------------------------------------------------------------------
@@ -49,11 +39,8 @@ def train(in_tmp, monkeypatch, device):
 @pytest.mark.parametrize(
     "env_id, obs_mode, flags",
     [
-        ("MS-CartpoleBalance-v1", "rgb", {}),
-        ("MS-CartpoleBalance-v1", "depth", dict(include_state=False)),
-        ("MS-CartpoleBalance-v1", "segmentation", dict(frame_stack=3)),
-        ("MS-CartpoleBalance-v1", "rgb+segmentation", dict(camera_width=48, camera_height=40)),
-        ("MS-CartpoleBalance-v1", ALL_TEXTURES, dict(shader="default")),
+        ("MS-CartpoleBalance-v1", "rgb+segmentation", dict(frame_stack=3, camera_width=48, camera_height=40)),
+        ("MS-CartpoleBalance-v1", ALL_TEXTURES, dict(shader="default", include_state=False)),
         ("PushCube-v1", "rgb+depth", dict(robot_uids="panda_wristcam", camera_width=40, camera_height=40)),
     ],
 )
@@ -116,25 +103,23 @@ def test_cameras_of_every_task_are_known_without_building_it():
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("render_mode", ["all", "sensors", "rgb_array"])
-def test_view(render_mode):
+def test_view():
     """Every texture can be filmed, beside the scene or without one."""
     args = replace(
         ARGS, env_id="MS-CartpoleBalance-v1", obs_mode=ALL_TEXTURES, shader="default", camera_width=40,
-        camera_height=40, capture_video=True, render_mode=render_mode, frame_stack=2,
+        camera_height=40, capture_video=True, frame_stack=2,
     )  # fmt: skip
     env = ppo_rgb.make_env(args, "unused", True).env  # without the recorder
     env.reset(seed=0)
     env.step(env.action_space.sample())
-    image = env.render()
-    width = {"all": 512 + 85 + 11, "sensors": 40 + 8, "rgb_array": 512}[render_mode]  # multiples of 16
-    height = 6 * 40 if render_mode == "sensors" else 512
-    assert image.dtype == torch.uint8 and image.shape == (1, height, width, 3)
-    if render_mode == "sensors":
-        assert all(view.float().std() > 0 for view in image[0, :, :40].split(40))
-        env.unwrapped.render_rgb_array = lambda: None  # a task without a camera for people
-        env.unwrapped.render_mode = "all"
-        assert torch.equal(env.render(), image)
+    for render_mode, height, width in (("all", 512, 512 + 85 + 11), ("rgb_array", 512, 512), ("sensors", 6 * 40, 48)):
+        env.unwrapped.render_mode = render_mode
+        image = env.render()
+        assert image.dtype == torch.uint8 and image.shape == (1, height, width, 3), "multiples of 16"
+    assert all(view.float().std() > 0 for view in image[0, :, :40].split(40))
+    env.unwrapped.render_rgb_array = lambda: None  # a task without a camera for people
+    env.unwrapped.render_mode = "all"
+    assert torch.equal(env.render(), image)
     env.close()
 
 
@@ -266,40 +251,29 @@ def test_all_options_train(train):
         dict(encoder="impala", include_state=False, channels_last=False),
         dict(obs_mode="depth", amp=True),
     ):
-        metrics, checkpoint = train(total_timesteps=320, **flags)
+        metrics, checkpoint, _ = train(total_timesteps=320, **flags)
         assert [row["global_step"] for row in metrics if row["kind"] == "eval"] == [0, 320]
         assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
         assert not any(row.get("update_skipped") for row in metrics)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_learns_from_images(train, seed):
+def test_learns_from_images(train):
     """The goal is on the images alone, and as wide as a pixel: the mean action often stops just beside it."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
-    metrics, _ = train(seed=seed, num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
+    metrics, *_ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
     assert first["success_once"] < 0.1 and last["success_once"] >= 0.6
 
 
-def test_exact_resume_is_bit_identical(train, monkeypatch):
+def test_exact_resume_is_bit_identical(train, in_update, in_tmp):
     flags = dict(exact_resume=True, checkpoint_freq=2, obs_mode="rgb+segmentation", frame_stack=2, random_shift=2)
-    metrics, uninterrupted = train(**flags)
-    calls, update = [], ppo_rgb.update_minibatch
-
-    def crash(*args):
-        calls.append(1)
-        if len(calls) == 16 * 2 + 16 + 5:  # in the fourth iteration
-            raise ZeroDivisionError
-        return update(*args)
-
-    monkeypatch.setattr(ppo_rgb, "update_minibatch", crash)
-    with pytest.raises(ZeroDivisionError):
+    train(**flags)
+    in_update(3, crash, per_iteration=16)
+    with pytest.raises(Stop):
         train(**flags)
-    again, resumed = train(**flags, resume="runs/run2/last.pt")
-    assert same_weights(uninterrupted, resumed)
-    timeless = lambda rows: [{k: v for k, v in row.items() if not k.endswith(("time", "sps", "_mb"))} for row in rows]
-    assert timeless(metrics) == timeless(again)
+    train(**flags, resume="runs/run2")
+    assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
 
 
 def test_non_finite_state_skips_one_update(train, monkeypatch, capsys):
@@ -314,14 +288,14 @@ def test_non_finite_state_skips_one_update(train, monkeypatch, capsys):
         return obs
 
     monkeypatch.setattr(batched_env.BatchedReachImages, "observe", broken)
-    metrics, checkpoint = train()
+    metrics, checkpoint, _ = train()
     assert sum(row.get("update_skipped", 0) for row in metrics) == 1
     assert "state" in capsys.readouterr().out
     assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
 
 
 MEASURE = """
-import contextlib, resource, sys
+import contextlib, re, sys
 sys.path[:0] = [{root!r}, {root!r} + "/tests"]
 import batched_env, ppo_rgb, test_rgb
 from dataclasses import replace
@@ -330,7 +304,9 @@ args = replace(test_rgb.SMALL_IMAGES, exp_name="memory", num_steps=int(sys.argv[
                total_timesteps=64 * int(sys.argv[1]), update_epochs=1, obs_mode="rgb+depth")
 with contextlib.ExitStack() as closing, contextlib.redirect_stdout(sys.stderr):
     ppo_rgb.train(args, closing)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, ppo_rgb.image_bytes(args, [(36, 36)] * 2))
+# not getrusage's, which starts at what the parent holds
+peak = int(re.search("VmHWM:[^0-9]*([0-9]+) kB", open("/proc/self/status").read())[1]) * 1024
+print(peak, ppo_rgb.image_bytes(args, [(36, 36)] * 2))
 """
 
 
@@ -338,7 +314,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, ppo_rgb.image_b
 def test_the_buffers_take_what_is_said_and_are_not_copied(tmp_path):
     """Peak memory of runs with a short and a long rollout."""
     peaks, sizes = [], []
-    for num_steps in (10, 200):
+    for num_steps in (10, 130):
         (tmp_path / str(num_steps)).mkdir()
         process = subprocess.run(
             [sys.executable, "-c", MEASURE.format(root=str(ROOT)), str(num_steps)],
@@ -348,7 +324,7 @@ def test_the_buffers_take_what_is_said_and_are_not_copied(tmp_path):
         peak, size = map(int, process.stdout.split())
         peaks.append(peak)
         sizes.append(size)
-    assert sizes[1] > 150 * 2**20
+    assert sizes[1] > 100 * 2**20
     assert (peaks[1] - peaks[0]) / (sizes[1] - sizes[0]) == pytest.approx(1, abs=0.2)
 
 
@@ -362,20 +338,19 @@ SCRIPT = ROOT / "ppo_rgb.py"
 
 
 @pytest.mark.render
-def test_train_resume_evaluate_and_film(tmp_path):
+def test_train_resume_evaluate_and_film(tmp_path, monkeypatch):
     run = tmp_path / "runs/tiny"
     process = run_script(
-        *TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 1, cwd=tmp_path, script=SCRIPT
+        *TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 2, cwd=tmp_path, script=SCRIPT
     )
     assert process.returncode == 0 and process.stderr == "", process.stderr
     assert "images of a rollout (40x40, 20 steps of 1 environments)" in process.stdout
-    process = run_script("--resume", run, "--total_timesteps", 60, cwd=tmp_path, script=SCRIPT)
-    assert process.returncode == 0 and process.stderr == "", process.stderr
+    assert ppo_rgb.main(["--resume", str(run), "--total_timesteps", "60"]) == 0
     rows = read_metrics(run)
     assert [row["global_step"] for row in rows if row["kind"] == "train"] == [20, 40, 60]
-    assert [row["global_step"] for row in rows if row["kind"] == "eval"] == [0, 20, 40, 60]
+    assert [row["global_step"] for row in rows if row["kind"] == "eval"] == [0, 40, 60]
     videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))
-    assert videos == [f"step_{step:09d}.mp4" for step in (0, 20, 40, 60)]
+    assert videos == [f"step_{step:09d}.mp4" for step in (0, 40, 60)]
     import imageio.v3 as iio
 
     images = iio.imread(run / "videos" / videos[-1])
@@ -384,9 +359,9 @@ def test_train_resume_evaluate_and_film(tmp_path):
     assert scene.std() > 2 and rgb.std() > 2 and depth.std() > 0.5, "the wall is far and the cart hardly nearer"
     # evaluation needs the checkpoint alone: the cameras are its own
     (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
     flags = ("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 1, "--num_eval_envs", 1)
-    process = run_script(*flags, cwd=tmp_path / "elsewhere", script=SCRIPT)
-    assert process.returncode == 0, process.stderr
+    assert ppo_rgb.main([*map(str, flags)]) == 0
     assert json.loads((run / "eval.json").read_text())["episode_len"] == 8
     assert (run / "test_videos/seed_0.mp4").exists()
 
@@ -419,8 +394,4 @@ def test_without_vulkan_it_says_what_to_install(tmp_path):
 )
 def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
     monkeypatch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
-    with pytest.raises(SystemExit) as exit:
-        ppo_rgb.main(["--no-cuda", *arguments.split()])
-    output = capsys.readouterr().err
-    assert exit.value.code == 2 and output.count("\n") == 1 and message in output, output
-    assert not list(in_tmp.iterdir())
+    assert message in refused(["--no-cuda", *arguments.split()], capsys, ppo_rgb)

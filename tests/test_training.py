@@ -17,13 +17,14 @@ FINITE_HORIZON = dict(finite_horizon_gae=True, shared_features=True, clip_vloss=
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, seed",
-    [({}, 1), ({}, 2), ({}, 3), (TEXTBOOK, 1), (FINITE_HORIZON, 1)],
-    ids=["default-1", "default-2", "default-3", "textbook", "finite-horizon"],
+    [({}, 1), (TEXTBOOK, 2), (FINITE_HORIZON, 3)],
+    ids=["default", "textbook", "finite-horizon"],
 )
 def test_learns(train, flags, seed):
-    metrics, *_ = train(seed=seed, total_timesteps=60_000, eval_freq=0, learning_rate=1e-3, update_epochs=8, **flags)
+    size = dict(num_envs=128, total_timesteps=40_000, eval_freq=0)
+    metrics, *_ = train(seed=seed, learning_rate=1e-3, update_epochs=8, **size, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
-    assert first["success_once"] < 0.6
+    assert first["success_once"] < 0.2
     assert last["success_once"] >= 0.95 and last["num_episodes"] == 24
 
 
@@ -151,7 +152,6 @@ def test_failure_in_the_middle_keeps_what_was_learned(train, in_tmp, monkeypatch
         train(update_epochs=4)
     last = ppo.load_checkpoint(in_tmp / "runs/run1/last.pt")
     assert last["iteration"] == 1 and last["global_step"] == 320
-    assert (in_tmp / "runs/run1/learning_curve.png").exists()
 
 
 def test_anneal_lr_reaches_zero(train):

@@ -1,0 +1,147 @@
+"""Several objects at random places, and episodes and environments that differ: push the red block over the line.
+
+    python ppo.py --env_id examples.push_from_clutter:PushFromClutter-v1
+
+What it teaches, beside examples/push_to_goal.py:
+
+* Placing without overlap, with ManiSkill's UniformPlacementSampler: see `_free_places`.
+* Domain randomisation. Sizes, masses, friction and colours differ between environments, and belong in `_load_scene`:
+  on a GPU they cannot change once the simulation has started (ManiSkill refuses), so a batch of a thousand environments
+  has a thousand different scenes for good. With few environments, as on a CPU, let scenes be rebuilt now and then:
+  `reconfiguration_freq` below. Poses, velocities and goals belong in `_initialize_episode`.
+"""
+
+import sapien
+import torch
+from mani_skill.agents.robots import Panda
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.samplers import UniformPlacementSampler
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.building import actors
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.scene_builder.table import TableSceneBuilder
+from mani_skill.utils.structs import Actor, Pose
+from sapien.physx import PhysxMaterial
+
+
+@register_env("PushFromClutter-v1", max_episode_steps=50)
+class PushFromClutterEnv(BaseEnv):
+    SUPPORTED_ROBOTS = ["panda"]
+    agent: Panda
+
+    num_blocks = 5  # the red one and four others
+    region = ((-0.12, -0.2), (0.12, 0.2))  # of the blocks' centres: lowest and highest x and y
+    line = 0.2  # x of the line
+
+    def __init__(self, *args, robot_uids="panda", num_envs=1, reconfiguration_freq=None, enhanced_determinism=True,
+                 **kwargs):  # fmt: skip
+        if reconfiguration_freq is None:  # other blocks after so many episodes, where a scene holds one environment
+            reconfiguration_freq = 20 if num_envs == 1 else 0
+        super().__init__(*args, robot_uids=robot_uids, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq,
+                         enhanced_determinism=enhanced_determinism, **kwargs)  # fmt: skip
+
+    @property
+    def _default_sensor_configs(self):
+        pose = sapien_utils.look_at(eye=[0.5, 0, 0.5], target=[0.0, 0, 0.0])
+        return [CameraConfig("base_camera", pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
+
+    @property
+    def _default_human_render_camera_configs(self):
+        pose = sapien_utils.look_at(eye=[0.6, 0.6, 0.6], target=[0.0, 0.0, 0.1])
+        return CameraConfig("render_camera", pose, width=512, height=512, fov=1.0, near=0.01, far=10)
+
+    def _load_agent(self, options):
+        super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
+
+    def _load_scene(self, options):
+        self.table_scene = TableSceneBuilder(self, robot_init_qpos_noise=0.02)
+        self.table_scene.build()
+        self.half_sizes = torch.zeros(self.num_envs, self.num_blocks, device=self.device)  # metres
+        self.blocks = [self._build_block(k) for k in range(self.num_blocks)]
+        self.goal_line = actors.build_box(
+            self.scene, [0.002, 0.3, 1e-4], color=[0.8, 0.1, 0.1, 1], name="line", body_type="kinematic",
+            add_collision=False, initial_pose=sapien.Pose(p=[self.line, 0, 0]),
+        )  # fmt: skip
+
+    def _build_block(self, k):
+        """Block k of all environments: one built for each, then joined so that the task can handle them as one. The
+        numbers are from each environment's own generator, which is seeded before scenes are built too."""
+        blocks = []
+        for i in range(self.num_envs):
+            half_size, friction, density, red, green, blue = self._batched_episode_rng[i].uniform(
+                [0.015, 0.2, 300, 0, 0.2, 0.2], [0.03, 1.0, 1500, 0.4, 1, 1]
+            )
+            color = [0.8, 0.05, 0.05, 1] if k == 0 else [red, green, blue, 1]
+            builder = self.scene.create_actor_builder()
+            builder.add_box_collision(
+                half_size=[half_size] * 3, material=PhysxMaterial(friction, friction, 0), density=density
+            )
+            builder.add_box_visual(half_size=[half_size] * 3, material=color)
+            builder.set_scene_idxs([i])
+            builder.initial_pose = sapien.Pose(p=[0.1 * k, 0.5, half_size])  # apart from each other
+            blocks.append(builder.build(name=f"block {k} of environment {i}"))
+            self.remove_from_state_dict_registry(blocks[-1])  # environment states hold the joined one
+            self.half_sizes[i, k] = half_size
+        joined = Actor.merge(blocks, name=f"block {k}")
+        self.add_to_state_dict_registry(joined)
+        return joined
+
+    def _free_places(self, half_sizes, rng):
+        """Centres (n, 2) of n blocks that do not overlap, however they are turned; nan for one that finds no place.
+
+        The sampler draws from torch's global generator, as often as the fullest environment of its batch needs: one
+        for each environment, seeded from its own generator, keeps its episodes independent of the others."""
+        radii = half_sizes.cpu() * 2**0.5
+        with torch.random.fork_rng(devices=[]):  # puts the global generator back afterwards
+            torch.default_generator.manual_seed(int(rng.randint(2**31)))
+            sampler = UniformPlacementSampler(self.region, batch_size=1)
+            places = torch.cat([sampler.sample(radius, max_trials=100) for radius in radii])
+        # Where it finds no place the sampler says nothing and returns the origin: ask whether the place is free.
+        distances = torch.cdist(places, places) - radii - radii[:, None]
+        taken = (distances.tril(diagonal=-1) < 0).any(dim=1)  # by a block that was placed before
+        places[taken] = torch.nan
+        return places
+
+    def _initialize_episode(self, env_idx, options):
+        b = len(env_idx)
+        rngs = self._batched_episode_rng[env_idx]
+        places = [self._free_places(sizes, rng) for sizes, rng in zip(self.half_sizes[env_idx], rngs.rngs)]
+        angles = rngs.uniform(0, 3.14, size=self.num_blocks)  # (b, num_blocks)
+        with torch.device(self.device):
+            self.table_scene.initialize(env_idx)
+            places = torch.stack(places).to(self.device)  # (b, num_blocks, 2)
+            angles = torch.as_tensor(angles, dtype=torch.float32)
+            for k, block in enumerate(self.blocks):
+                p, q = torch.zeros(b, 3), torch.zeros(b, 4)
+                p[:, :2] = places[:, k]
+                p[:, 2] = self.half_sizes[env_idx, k]
+                # no place: out of the way on the floor, 0.92 m below the table's top, rather than inside another block
+                p = torch.where(p.isnan().any(dim=1, keepdim=True), torch.tensor([1.5, 0.2 * k, -0.85]), p)
+                q[:, 0], q[:, 3] = torch.cos(angles[:, k] / 2), torch.sin(angles[:, k] / 2)
+                block.set_pose(Pose.create_from_pq(p, q))
+
+    def evaluate(self):
+        position = self.blocks[0].pose.p
+        fell = position[:, 2] < 0
+        return {"success": (position[:, 0] > self.line) & ~fell, "fail": fell}
+
+    def _get_obs_extra(self, info):
+        obs = dict(tcp_pose=self.agent.tcp.pose.raw_pose)
+        if self.obs_mode_struct.use_state:
+            obs.update(blocks=torch.cat([block.pose.raw_pose for block in self.blocks], dim=1), sizes=self.half_sizes)
+        return obs
+
+    def compute_dense_reward(self, obs, action, info):
+        """Between 0 and 3: the hand behind the red block, 1; the block near the line, 1; success, 3."""
+        block = self.blocks[0].pose.p
+        push_from = block.clone()
+        push_from[:, 0] -= self.half_sizes[:, 0] + 0.01
+        reach = 1 - torch.tanh(5 * torch.linalg.norm(push_from - self.agent.tcp.pose.p, dim=1))
+        push = 1 - torch.tanh(5 * (self.line - block[:, 0]).clamp(min=0))
+        reward = reach + push
+        reward[info["success"]] = 3
+        return reward
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info) / 3

@@ -1,0 +1,220 @@
+"""The example tasks: their episodes follow from their seeds alone, on every backend; and the faults that
+tests/test_task.py is to find, put into copies of one of them."""
+
+import importlib
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import test_task
+import torch
+from batched_physx import batched_physx
+from conftest import ROOT, read_metrics
+from test_cpu_vector_env import play
+from test_task import EXAMPLES, NUM_ENVS, everything, make, seeds
+
+import ppo
+
+ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=NUM_ENVS, capture_video=False, reconfiguration_freq=0)
+
+
+@pytest.fixture
+def stand_in():
+    with batched_physx():
+        yield
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        *EXAMPLES,
+        # torch's global generator, and the robot's joints from the generator of the first environment: when this one
+        # passes, ManiSkill was mended, and the examples can become simpler
+        pytest.param("PushCube-v1", marks=pytest.mark.xfail(strict=True, raises=AssertionError)),
+    ],
+)
+def test_episodes_follow_from_their_seeds(stand_in, env_id):
+    """Whenever an environment resets, and whichever others do with it."""
+    env = make(env_id, num_envs=NUM_ENVS)
+    histories = []
+    for groups in ([[0, 1, 2, 3], [0, 1, 2, 3]], [[2], [0, 1], [2, 3], [1], [0, 3]]):
+        env.reset(seed=seeds(40))
+        history = [[] for _ in range(NUM_ENVS)]
+        for group in groups:
+            test_task.play(env, len(groups))
+            env.reset(options={"env_idx": torch.tensor(group)})
+            for i in group:
+                history[i].append({k: v[i] for k, v in everything(env).items() if not k.startswith("attribute")})
+        histories.append(history)
+    for one, other in zip(*histories):
+        for a, b in zip(one, other, strict=True):
+            for name in a:
+                torch.testing.assert_close(a[name], b[name], msg=name)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", EXAMPLES)
+def test_same_start_on_cpu_and_gpu(env_id):
+    """Each environment of a batch starts as one alone does with its seed, blocks of many sizes included."""
+    options = dict(reconfigure=True)
+    alone = []
+    env = gym.make(env_id, obs_mode="state", sim_backend="physx_cpu", render_backend="none")
+    for seed in seeds(40):
+        obs, _ = env.reset(seed=seed, options=options)
+        alone.append(obs)
+    env.close()
+    with batched_physx():
+        env = make(env_id, num_envs=NUM_ENVS)
+        obs, _ = env.reset(seed=seeds(40), options=options)
+        torch.testing.assert_close(obs, torch.cat(alone), rtol=1e-4, atol=1e-5)
+        env.close()
+
+
+def test_cpu_pool_equals_gpu_batch(stand_in, tmp_path):
+    """The same seeds and actions in worker processes and in ManiSkill's batch: the same episodes, resets, metrics, and
+    levels of the curriculum."""
+    args = replace(ARGS, env_id=EXAMPLES[2], env_kwargs='{"max_episode_steps": 9}')
+    results = []
+    for backend in ("physx_cpu", "physx_cuda"):
+        envs = ppo.make_envs(replace(args, sim_backend=backend, render_backend="none"), tmp_path)
+        actions = torch.rand(45, NUM_ENVS, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
+        results.append(play(envs, seeds(40), actions))
+        envs.close()
+    resets = 0
+    for pool, batch in zip(*results, strict=True):
+        assert batch.keys() == pool.keys()
+        resets += "info._final_info" in batch
+        for name in batch:
+            torch.testing.assert_close(pool[name], batch[name], rtol=1e-4, atol=1e-5, msg=name)
+    assert resets >= 4
+
+
+def test_full_table(stand_in, monkeypatch):
+    """Blocks for which there is no place lie on the floor, not in each other; the others are where they were."""
+    from examples.push_from_clutter import PushFromClutterEnv
+
+    monkeypatch.setattr(PushFromClutterEnv, "num_blocks", 30)
+    env = make(EXAMPLES[1], num_envs=NUM_ENVS)
+    env.reset(seed=seeds(3))
+    heights = torch.stack([block.pose.p[:, 2] for block in env.unwrapped.blocks], dim=1)
+    on_floor = (heights < -0.5).sum(dim=1)
+    assert ((on_floor > 0) & (on_floor < 29)).all() and (heights[:, 0] > 0).all()
+    for system in env.unwrapped.scene.px.systems:
+        system.step()
+        depths = [-point.separation for contact in system.get_contacts() for point in contact.points]
+        assert max(depths) < 2e-3
+    env.close()
+
+
+def test_curriculum(stand_in):
+    envs = ppo.ManiSkillVectorEnv(make(EXAMPLES[2], num_envs=NUM_ENVS, max_episode_steps=5), record_metrics=True)
+    task, still = envs.base_env, torch.zeros(NUM_ENVS, 8)
+    envs.reset(seed=seeds(0))
+    assert task.difficulty.tolist() == [1, 1, 1, 1], "an episode from a seed is of the task itself"
+    for _ in range(5):  # nothing is learned of the level from it
+        infos = envs.step(still)[-1]
+    assert infos["_final_info"].all() and task.difficulty.tolist() == task.level.tolist() == [0, 0, 0, 0]
+    near = [torch.linalg.norm(task.goal.pose.p - task.cube.pose.p, dim=1).max()]
+    for episode in range(4):  # the first two environments succeed at once, the others not
+        task.scene._reset_mask[2:] = False
+        task.cube.set_pose(ppo_pose(task, 2))
+        task.scene._reset_mask[:] = True
+        task.scene._gpu_apply_all()
+        task.scene._gpu_fetch_all()
+        infos = envs.step(still)[-1]
+        assert infos["_final_info"].tolist() == [True, True, episode == 4, episode == 4]
+        assert infos["final_info"]["level"][:2].tolist() == pytest.approx([0.1 * episode] * 2)
+    assert task.level.tolist() == pytest.approx([0.4, 0.4, 0, 0])
+    for _ in range(5):
+        envs.step(still)
+    assert task.level.tolist() == pytest.approx([0.1, 0.1, 0, 0]), "as much lower after a failure as three raise it"
+    envs.reset(options={"env_idx": torch.tensor([1, 3]), "difficulty": torch.tensor([0.25, 0.75])})
+    assert task.difficulty[[1, 3]].tolist() == [0.25, 0.75]
+    envs.reset(seed=seeds(0), options={"difficulty": 0.0})
+    far = envs.reset(seed=seeds(0)) and torch.linalg.norm(task.goal.pose.p - task.cube.pose.p, dim=1).max()
+    assert near[0] < 0.125 < far
+    envs.close()
+
+
+def ppo_pose(task, count):
+    """Where the cube is at its goal, for the first environments."""
+    from mani_skill.utils.structs import Pose
+
+    position = task.goal.pose.p[:count].clone()
+    position[:, 2] = task.cube_half_size
+    return Pose.create_from_pq(position)
+
+
+# --- what the tester finds ---
+
+FAULTS = {
+    "ignores env_idx": (
+        "            p = torch.full((b, 3), 1e-3)\n",
+        "            self.start = self.cube.pose.p.clone()\n            p = torch.full((b, 3), 1e-3)\n",
+        "changes the attribute start of environments .* env_idx is ignored",
+    ),
+    "draws num_envs rows": (
+        "_batched_episode_rng[env_idx].uniform(size=5)",
+        "_batched_episode_rng.uniform(size=5)",
+        r"must have len\(env_idx\) rows, not num_envs",
+    ),
+    "forgets the robot": (
+        "            self.table_scene.initialize(env_idx)",
+        "            pass",
+        "the joint positions of panda is left from the episode before",
+    ),
+    "objects overlap": (
+        "            self.goal.set_pose(",
+        "            self.other.set_pose(Pose.create_from_pq(self.cube.pose.p[env_idx] + torch.tensor([0.03, 0, 0])))\n"
+        "            self.goal.set_pose(",
+        "overlap by [0-9]+ mm",
+    ),
+    "unseeded numpy": (
+        "self._batched_episode_rng[env_idx].uniform(size=5)",
+        "np.random.default_rng().uniform(size=(b, 5))",
+        "resets with the same seeds differ in the pose of .*: it is drawn from an unseeded generator",
+    ),
+}
+OTHER_CUBE = """
+        at = sapien.Pose(p=[0, 0.5, 0.02])
+        self.other = actors.build_cube(self.scene, 0.02, color=[0, 0, 0, 1], name="other", initial_pose=at)
+"""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_broken_copies_are_found(stand_in, fault, tmp_path, monkeypatch):
+    right, wrong, message = FAULTS[fault]
+    source = (ROOT / "examples/push_to_goal.py").read_text()
+    assert right in source
+    source = source.replace(right, wrong).replace("PushToGoal-v1", "Broken-v1")
+    if "self.other" in wrong:
+        source = source.replace("    # --- how an episode starts ---", OTHER_CUBE)
+    (tmp_path / "broken.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    monkeypatch.delitem(importlib.sys.modules, "broken", raising=False)
+    for registry in (gym.registry, ppo.REGISTERED_ENVS):
+        registry.pop("Broken-v1", None)
+    env = make("broken:Broken-v1", num_envs=NUM_ENVS)
+    with pytest.raises(AssertionError, match=message):
+        for check in (test_task.check_seeds, test_task.check_everything_is_initialised, test_task.check_partial_reset):
+            check(env)
+        test_task.check_overlap(env, resets=20)
+    env.close()
+
+
+# --- as commands ---
+
+
+@pytest.mark.parametrize("env_id", EXAMPLES)
+def test_trains(env_id, in_tmp):
+    flags = ("--env_id", env_id, "--num_envs", 2, "--num_steps", 40, "--total_timesteps", 160, "--num_minibatches", 2,
+             "--num_eval_envs", 1, "--num_eval_episodes", 2, "--eval_reconfiguration_freq", 1, "--no-cuda",
+             "--env_kwargs", json.dumps(dict(max_episode_steps=10)), "--exp-name", "x",
+             "--no-capture_video")  # fmt: skip
+    assert ppo.main([*map(str, flags)]) == 0
+    rows = read_metrics(in_tmp / "runs/x")
+    assert all(np.isfinite(row["return"]) for row in rows)
+    assert ("level" in rows[1]) == ("curriculum" in env_id)

@@ -1,0 +1,321 @@
+"""Does a task start its episodes as ManiSkill's batches need it? For the examples, some of ManiSkill's, and yours:
+
+    pytest tests/test_task.py --env_id my_module:MyTask-v1
+
+Resets of some of several environments need a GPU in ManiSkill. Here they run ManiSkill's own code for it on
+tests/batched_physx.py, which simulates on the CPU, and on `physx_cuda` itself where there is one; the summary
+says where.
+"""
+
+import contextlib
+import os
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from batched_physx import batched_physx
+
+import ppo
+
+# isort: split
+import mani_skill.envs  # noqa: F401
+from mani_skill.utils.structs import Pose
+
+NUM_ENVS = 4
+EXAMPLES = [
+    "examples.push_to_goal:PushToGoal-v1",
+    "examples.push_from_clutter:PushFromClutter-v1",
+    "examples.curriculum:PushFurther-v1",
+]
+MANISKILL = ["PushCube-v1", "PickCube-v1", "StackCube-v1", "MS-CartpoleBalance-v1"]
+
+
+def pytest_generate_tests(metafunc):
+    if "env_id" in metafunc.fixturenames:
+        given = metafunc.config.getoption("--env_id")
+        sys.path.insert(0, os.getcwd())
+        metafunc.parametrize("env_id", given or EXAMPLES + MANISKILL, scope="module")
+
+
+def has_physx_cuda():
+    if not torch.cuda.is_available():
+        return False
+    import sapien.physx
+
+    with contextlib.suppress(RuntimeError):
+        sapien.physx.enable_gpu()
+        return True
+    return False
+
+
+WHERE = ["stand-in", pytest.param("physx_cuda", marks=pytest.mark.skipif(not has_physx_cuda(), reason="no PhysX GPU"))]
+
+
+def make(env_id, **kwargs):
+    return gym.make(env_id, obs_mode="state", sim_backend="physx_cuda", render_backend="none", **kwargs)
+
+
+@pytest.fixture(scope="module", params=WHERE)
+def envs(env_id, request):
+    """NUM_ENVS environments of the task in one batch."""
+    with batched_physx() if request.param == "stand-in" else contextlib.nullcontext():
+        env = make(env_id, num_envs=NUM_ENVS)
+        yield env
+        env.close()
+
+
+# ----- what is looked at ----------------------------------------------------------------------------------------------
+
+
+def everything(env):
+    """What an episode is made of, by name: tensors (num_envs, ...)."""
+    base, parts = env.unwrapped, {}
+    for name, actor in {**base.scene.actors, **base.scene.actor_views}.items():
+        if len(actor._objs) == base.num_envs and actor.px_body_type != "static":
+            parts[f"pose of {name}"] = actor.pose.raw_pose
+            if actor.px_body_type == "dynamic":
+                parts[f"velocity of {name}"] = torch.cat([actor.linear_velocity, actor.angular_velocity], dim=1)
+    for name, robot in base.scene.articulations.items():
+        if len(robot._objs) == base.num_envs:
+            parts |= {f"joint positions of {name}": robot.qpos, f"joint velocities of {name}": robot.qvel}
+            parts |= {f"base of {name}": robot.root_pose.raw_pose}
+
+    def collect(name, value):
+        if isinstance(value, Pose):
+            value = value.raw_pose
+        if isinstance(value, torch.Tensor):
+            parts[f"attribute {name}"] = value
+        elif isinstance(value, dict):
+            for k, v in value.items():
+                collect(f"{name}[{k!r}]", v)
+
+    inherited = vars(ppo.REGISTERED_ENVS["Empty-v1"].cls) if "Empty-v1" in ppo.REGISTERED_ENVS else {}
+    for name, value in vars(base).items():
+        if name not in inherited and name not in ("_last_obs", "_init_raw_obs", "_elapsed_steps", "_cached_obs"):
+            collect(name, value)
+    return {name: value.clone() for name, value in parts.items()}
+
+
+def rows_of(env, parts):
+    """Those of `parts` that have a row for each environment."""
+    return {k: v for k, v in parts.items() if v.ndim and len(v) == env.unwrapped.num_envs}
+
+
+def play(env, steps, seed=0):
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+
+
+def first_difference(a, b, rows=slice(None)):
+    for name in a.keys() | b.keys():
+        if name not in a or name not in b or a[name].shape != b[name].shape:
+            return name
+        if not torch.equal(a[name][rows], b[name][rows]):
+            return name
+    return None
+
+
+def seeds(start):
+    return list(range(start, start + NUM_ENVS))
+
+
+def reset_some(env, env_idx, **options):
+    try:
+        return env.reset(options={"env_idx": torch.tensor(env_idx, device=env.unwrapped.device), **options})
+    except (RuntimeError, IndexError, ValueError, AssertionError) as error:
+        raise AssertionError(
+            f"a reset of environments {env_idx} of {NUM_ENVS} fails: {error}. Whatever _initialize_episode makes must "
+            "have len(env_idx) rows, not num_envs"
+        ) from error
+
+
+# ----- the checks: each raises AssertionError with a message that names the fault -------------------------------------
+
+
+def check_observations(env):
+    """Of the declared space, and finite."""
+    space = env.get_wrapper_attr("single_observation_space")
+    obs, _ = env.reset(seed=seeds(0))
+    for step in range(10):
+        assert tuple(obs.shape[1:]) == space.shape, f"observations {tuple(obs.shape[1:])}, declared {space.shape}"
+        assert torch.isfinite(obs).all(), f"an observation is not finite {step} steps after the reset"
+        obs = env.step(env.action_space.sample())[0]
+
+
+def check_seeds(env):
+    """The same seeds give the same episodes, others give others."""
+    env.reset(seed=seeds(5))
+    first = everything(env)
+    env.reset(seed=seeds(5))
+    name = first_difference(first, everything(env))
+    assert name is None, f"two resets with the same seeds differ in the {name}: it is drawn from an unseeded generator"
+    env.reset(seed=seeds(500))
+    assert first_difference(first, everything(env)), "two seeds give the same episode: nothing is randomised"
+
+
+def check_everything_is_initialised(env):
+    """Nothing is left over from the episode before."""
+    env.reset(seed=seeds(5))
+    first = everything(env)
+    play(env, 15)
+    env.reset(seed=seeds(5))
+    after = everything(env)
+    for name in first:
+        if not name.startswith("attribute") and not torch.allclose(first[name], after[name], atol=1e-5):
+            raise AssertionError(f"the {name} is left from the episode before: _initialize_episode does not set it")
+
+
+def check_partial_reset(env):
+    """Touches the environments of env_idx, and no other."""
+    env.reset(seed=seeds(5))
+    for env_idx in ([1, 3], [2], [0], [0, 1, 2]):
+        play(env, 4)
+        before = everything(env)
+        reset_some(env, env_idx)
+        after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
+        for name in rows_of(env, before):
+            assert before[name].shape == after[name].shape, (
+                f"the {name} has shape {tuple(after[name].shape)} after a reset of environments {env_idx}: write to "
+                "its rows, [env_idx]"
+            )
+            assert torch.equal(before[name][others], after[name][others]), (
+                f"a reset of environments {env_idx} changes the {name} of environments {others}: env_idx is ignored"
+            )
+        assert first_difference(before, after, env_idx), f"a reset of environments {env_idx} does nothing"
+
+
+def check_overlap(env, resets=1000, tolerance=2e-3):
+    """No free object starts inside another, by PhysX's own contacts; only where the stand-in simulates."""
+    env.reset(seed=seeds(10_000))
+    systems = env.unwrapped.scene.px.systems
+    for k in range(resets // NUM_ENVS):
+        for i, system in enumerate(systems):
+            free = set(system.rigid_dynamic_components)
+            system.step()
+            for contact in system.get_contacts():
+                if free & set(contact.bodies):
+                    depth = -min([point.separation for point in contact.points], default=0)
+                    names = " and ".join(body.entity.name.removeprefix(f"scene-{i}_") for body in contact.bodies)
+                    assert depth < tolerance, (
+                        f"{names} overlap by {1000 * depth:.0f} mm in reset {k} of environment {i}"
+                    )
+        env.reset()
+
+
+def check_options(env):
+    """What is given to reset reaches _initialize_episode."""
+    seen, initialize = [], env.unwrapped._initialize_episode
+
+    def spy(env_idx, options):
+        seen.append(options)
+        return initialize(env_idx, options)
+
+    env.unwrapped._initialize_episode = spy
+    try:
+        reset_some(env, [1, 2], something=3)
+    finally:
+        del env.unwrapped._initialize_episode
+    assert seen and seen[-1].get("something") == 3, "reset's options do not reach _initialize_episode"
+
+
+def check_restoring_states(env):
+    """reset_to_env_states gives back exactly what was, without _initialize_episode."""
+    env.reset(seed=seeds(5))
+    play(env, 5)
+    read = lambda: {k: v for part in env.unwrapped.get_state_dict().values() for k, v in part.items()}
+    rows = lambda tree, i: {k: rows(v, i) for k, v in tree.items()} if isinstance(tree, dict) else tree[i]
+    state, flat, expected = env.unwrapped.get_state_dict(), read(), everything(env)
+    play(env, 5)
+    env.unwrapped._initialize_episode = lambda env_idx, options: pytest.fail("_initialize_episode was called")
+    try:
+        env.reset(options=dict(reset_to_env_states=dict(env_states=state)))
+        restored = everything(env)
+        for name, value in expected.items():
+            if not name.startswith("attribute"):
+                assert torch.allclose(restored[name], value, atol=1e-5), f"the {name} is not restored"
+        env_idx = torch.tensor([1, 3], device=env.unwrapped.device)
+        play(env, 5)
+        before = read()
+        env.reset(options=dict(env_idx=env_idx, reset_to_env_states=dict(env_states=rows(state, env_idx))))
+        for name, after in read().items():
+            assert torch.allclose(after[[1, 3]], flat[name][[1, 3]], atol=1e-5), f"not restored: {name} of [1, 3]"
+            assert torch.equal(after[[0, 2]], before[name][[0, 2]]), f"restoring [1, 3] changes {name} of [0, 2]"
+    finally:
+        del env.unwrapped._initialize_episode
+
+
+def check_rewards(env_id, steps=60):
+    """Normalised dense rewards are within [0, 1], dense ones bounded; random actions do not always succeed."""
+    modes = ppo.find_task(env_id).cls.SUPPORTED_REWARD_MODES
+    for mode in [mode for mode in ("normalized_dense", "dense") if mode in modes]:
+        env = make(env_id, num_envs=NUM_ENVS, reward_mode=mode)
+        env.reset(seed=seeds(3))
+        succeeded, rng = torch.zeros(NUM_ENVS, dtype=torch.bool), np.random.default_rng(0)
+        for _ in range(steps):
+            obs, reward, *_, info = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+            assert torch.isfinite(obs).all() and torch.isfinite(reward).all(), "random actions give what is not finite"
+            low, high = (-1e-5, 1 + 1e-5) if mode == "normalized_dense" else (-1e3, 1e3)
+            assert ((reward >= low) & (reward <= high)).all(), f"{mode} reward {reward.tolist()}"
+            succeeded |= info.get("success", torch.zeros_like(succeeded)).cpu()
+        env.close()
+        assert not succeeded.all(), "random actions succeed everywhere: what is success?"
+
+
+def check_autoreset(env_id):
+    """Where an episode ended, the final observation is not the first of the next one."""
+    envs = ppo.ManiSkillVectorEnv(make(env_id, num_envs=NUM_ENVS, max_episode_steps=6), record_metrics=True)
+    envs.reset(seed=seeds(3))
+    ended = torch.zeros(NUM_ENVS, dtype=torch.bool)
+    for _ in range(14):
+        obs, *_, infos = envs.step(torch.as_tensor(envs.action_space.sample()))
+        if "final_observation" in infos:
+            done = infos["_final_info"]
+            same = (infos["final_observation"][done] == obs[done]).all(dim=1)
+            assert not same.any(), "the final observation is the one after the reset"
+            ended |= done.cpu()
+    envs.close()
+    assert ended.all(), "no episode ended at its time limit"
+
+
+# ----- on each task ---------------------------------------------------------------------------------------------------
+
+
+def test_observations(envs):
+    check_observations(envs)
+
+
+def test_seeds(envs):
+    check_seeds(envs)
+
+
+def test_everything_is_initialised(envs):
+    check_everything_is_initialised(envs)
+
+
+def test_partial_reset(envs):
+    check_partial_reset(envs)
+
+
+def test_no_overlap(envs):
+    if not hasattr(envs.unwrapped.scene.px, "systems"):
+        pytest.skip("contacts are asked of the stand-in")
+    check_overlap(envs)
+
+
+def test_options(envs):
+    check_options(envs)
+
+
+def test_restoring_states(envs):
+    check_restoring_states(envs)
+
+
+def test_rewards(envs, env_id):
+    check_rewards(env_id)
+
+
+def test_autoreset(envs, env_id):
+    check_autoreset(env_id)
