@@ -42,6 +42,22 @@ def pytest_addoption(parser):
     parser.addoption("--env_id", action="append", help="task that tests/test_task.py looks at (may be repeated)")
 
 
+def pytest_terminal_summary(terminalreporter):
+    """Where the checks of tasks ran: resets of some of several environments are ManiSkill's business on a GPU."""
+    for where in ("stand-in", "physx_cuda"):
+        reports = [
+            sum(
+                where in report.nodeid and "test_task.py" in report.nodeid
+                for report in terminalreporter.stats.get(k, ())
+            )
+            for k in ("passed", "failed", "skipped")
+        ]
+        if any(reports):
+            name = "the CPU stand-in for PhysX's GPU simulation" if where == "stand-in" else "PhysX's GPU simulation"
+            counts = "{} checks of tasks passed, {} failed, {} did not run".format(*reports)
+            terminalreporter.write_line(f"on {name}: {counts}")
+
+
 def pytest_runtest_setup(item):
     if item.get_closest_marker("gpu") and not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")

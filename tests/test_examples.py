@@ -210,7 +210,7 @@ def test_broken_copies_are_found(stand_in, fault, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("env_id", EXAMPLES)
 def test_trains(env_id, in_tmp):
-    flags = ("--env_id", env_id, "--num_envs", 2, "--num_steps", 40, "--total_timesteps", 160, "--num_minibatches", 2,
+    flags = ("--env_id", env_id, "--num_envs", 1, "--num_steps", 40, "--total_timesteps", 80, "--num_minibatches", 2,
              "--num_eval_envs", 1, "--num_eval_episodes", 2, "--eval_reconfiguration_freq", 1, "--no-cuda",
              "--env_kwargs", json.dumps(dict(max_episode_steps=10)), "--exp-name", "x",
              "--no-capture_video")  # fmt: skip

@@ -499,20 +499,19 @@ def test_physics_that_explode_are_survived(tmp_path):
 
 
 @pytest.mark.slow
-def test_exact_resume_with_real_tasks(start, tmp_path):
+def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch):
     """The pool, and one environment in the process: stopped by kill -9 or a signal, the same as never stopped."""
+    monkeypatch.chdir(tmp_path)
     for num_envs, signum in ((4, signal.SIGTERM), (1, signal.SIGKILL)):
         flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_steps", 20,
                  "--total_timesteps", 10 * 20 * num_envs, "--eval_freq", 7, "--num_eval_episodes", 1,
                  "--env_kwargs", '{"max_episode_steps": 15}']  # fmt: skip
-        whole = run_script(*flags, "--exp-name", "whole", cwd=tmp_path, env=NO_VULKAN)
-        assert whole.returncode == 0, whole.stderr
+        assert ppo.main([*map(str, flags), "--exp-name", "whole"]) == 0
         process, _ = start(*flags, wait_for_rows=6)
         process.send_signal(signum)
         process.communicate(timeout=60)
         assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "it was stopped before its end"
-        again = run_script("--resume", "runs/x", cwd=tmp_path, env=NO_VULKAN)
-        assert again.returncode == 0, again.stderr
+        assert ppo.main(["--resume", "runs/x"]) == 0
         assert same_run(tmp_path / "runs/whole", tmp_path / "runs/x")
         shutil.rmtree(tmp_path / "runs")
 

@@ -338,13 +338,13 @@ SCRIPT = ROOT / "ppo_rgb.py"
 
 
 @pytest.mark.render
-def test_train_resume_evaluate_and_film(tmp_path, monkeypatch):
+def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs/tiny"
-    process = run_script(
-        *TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 2, cwd=tmp_path, script=SCRIPT
-    )
-    assert process.returncode == 0 and process.stderr == "", process.stderr
-    assert "images of a rollout (40x40, 20 steps of 1 environments)" in process.stdout
+    flags = (*TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 2)
+    assert ppo_rgb.main([*map(str, flags)]) == 0
+    output, errors = capfd.readouterr()
+    assert "images of a rollout (40x40, 20 steps of 1 environments)" in output and errors == ""
     assert ppo_rgb.main(["--resume", str(run), "--total_timesteps", "60"]) == 0
     rows = read_metrics(run)
     assert [row["global_step"] for row in rows if row["kind"] == "train"] == [20, 40, 60]

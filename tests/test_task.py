@@ -87,14 +87,12 @@ def everything(env):
             value = value.raw_pose
         if isinstance(value, torch.Tensor):
             parts[f"attribute {name}"] = value
-        elif isinstance(value, dict):
-            for k, v in value.items():
+        elif isinstance(value, (dict, list, tuple)):
+            for k, v in value.items() if isinstance(value, dict) else enumerate(value):
                 collect(f"{name}[{k!r}]", v)
 
-    inherited = vars(ppo.REGISTERED_ENVS["Empty-v1"].cls) if "Empty-v1" in ppo.REGISTERED_ENVS else {}
     for name, value in vars(base).items():
-        if name not in inherited and name not in ("_last_obs", "_init_raw_obs", "_elapsed_steps", "_cached_obs"):
-            collect(name, value)
+        collect(name, value)
     return {name: value.clone() for name, value in parts.items()}
 
 

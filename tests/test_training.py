@@ -1,12 +1,16 @@
 """The training loop on a torch-native batched environment inside the real ManiSkillVectorEnv: the path that GPU
 simulation takes, on whatever device there is."""
 
+import contextlib
+import json
+import math
 from dataclasses import replace
 
 import batched_env
 import pytest
 import torch
-from conftest import SMALL, box, same_weights
+from batched_physx import batched_physx
+from conftest import SMALL, box, read_metrics, same_weights
 
 import ppo
 
@@ -158,3 +162,22 @@ def test_anneal_lr_reaches_zero(train):
     metrics, *_ = train(anneal_lr=True, learning_rate=4e-4)
     rates = [row["learning_rate"] for row in metrics if row["kind"] == "train"]
     assert rates == pytest.approx([4e-4, 3e-4, 2e-4, 1e-4])
+
+
+def test_gpu_simulation(in_tmp, monkeypatch):
+    """The branch for `physx_cuda`, and ManiSkill's own code for it, on the stand-in for PhysX's GPU simulation."""
+    monkeypatch.setattr(ppo, "choose_device", lambda args: torch.device("cpu"))
+    args = ppo.Args(
+        sim_backend="physx_cuda", num_envs=4, num_steps=15, total_timesteps=120, num_minibatches=4, num_eval_envs=3,
+        num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True,
+        env_kwargs='{"max_episode_steps": 10}',
+    )  # fmt: skip
+    with batched_physx(), contextlib.ExitStack() as closing:
+        assert ppo.train(args, closing) == 0
+    rows = read_metrics(in_tmp / "runs/x")
+    assert [row["num_episodes"] for row in rows] == [5, 4, 8, 5] and rows[-1]["kind"] == "eval"
+    assert all(row["episode_len"] == 10 and math.isfinite(row["return"]) for row in rows)
+    episodes = json.loads((in_tmp / "runs/x/videos/trajectory_0.json").read_text())["episodes"]
+    assert len(episodes) == 12 and all(e["elapsed_steps"] == 10 for e in episodes), (
+        "two evaluations of two rounds of three"
+    )
