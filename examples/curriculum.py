@@ -47,8 +47,8 @@ class PushFurtherEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self):
-        pose = sapien_utils.look_at(eye=[0.6, 0.6, 0.6], target=[0.0, 0.0, 0.1])
-        return CameraConfig("render_camera", pose, width=512, height=512, fov=1.0, near=0.01, far=10)
+        pose = sapien_utils.look_at(eye=[0.5, 0.4, 0.45], target=[0.0, 0.0, 0.05])
+        return CameraConfig("render_camera", pose, width=512, height=512, fov=0.9, near=0.01, far=10)
 
     def _load_agent(self, options):
         super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
@@ -64,6 +64,7 @@ class PushFurtherEnv(BaseEnv):
             self.scene, self.goal_radius, thickness=1e-5, name="goal", body_type="kinematic", add_collision=False,
             initial_pose=sapien.Pose(p=[0.2, 0, 1e-3]),
         )  # fmt: skip
+        self._hidden_objects.append(self.goal)
         if not hasattr(self, "level"):  # it outlives the scene
             self.level = torch.zeros(self.num_envs, device=self.device)
         self.difficulty = torch.zeros(self.num_envs, device=self.device)  # of the current episode

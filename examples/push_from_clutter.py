@@ -48,8 +48,8 @@ class PushFromClutterEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self):
-        pose = sapien_utils.look_at(eye=[0.6, 0.6, 0.6], target=[0.0, 0.0, 0.1])
-        return CameraConfig("render_camera", pose, width=512, height=512, fov=1.0, near=0.01, far=10)
+        pose = sapien_utils.look_at(eye=[0.5, 0.4, 0.45], target=[0.0, 0.0, 0.05])
+        return CameraConfig("render_camera", pose, width=512, height=512, fov=0.9, near=0.01, far=10)
 
     def _load_agent(self, options):
         super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
@@ -60,7 +60,7 @@ class PushFromClutterEnv(BaseEnv):
         self.half_sizes = torch.zeros(self.num_envs, self.num_blocks, device=self.device)  # metres
         self.blocks = [self._build_block(k) for k in range(self.num_blocks)]
         self.goal_line = actors.build_box(
-            self.scene, [0.002, 0.3, 1e-4], color=[0.8, 0.1, 0.1, 1], name="line", body_type="kinematic",
+            self.scene, [0.004, 0.3, 1e-3], color=[0.8, 0.1, 0.1, 1], name="line", body_type="kinematic",
             add_collision=False, initial_pose=sapien.Pose(p=[self.line, 0, 0]),
         )  # fmt: skip
 

@@ -40,8 +40,8 @@ class PushToGoalEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self):  # what videos show
-        pose = sapien_utils.look_at(eye=[0.6, 0.6, 0.6], target=[0.0, 0.0, 0.1])
-        return CameraConfig("render_camera", pose, width=512, height=512, fov=1.0, near=0.01, far=10)
+        pose = sapien_utils.look_at(eye=[0.5, 0.4, 0.45], target=[0.0, 0.0, 0.05])
+        return CameraConfig("render_camera", pose, width=512, height=512, fov=0.9, near=0.01, far=10)
 
     # --- what is in the scene ---
 

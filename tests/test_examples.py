@@ -3,6 +3,8 @@ tests/test_task.py is to find, put into copies of one of them."""
 
 import importlib
 import json
+import os
+import subprocess
 from dataclasses import replace
 
 import gymnasium as gym
@@ -16,6 +18,7 @@ from test_cpu_vector_env import play
 from test_task import EXAMPLES, NUM_ENVS, everything, make, seeds
 
 import ppo
+import ppo_rgb
 
 ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=NUM_ENVS, capture_video=False, reconfiguration_freq=0)
 
@@ -218,3 +221,54 @@ def test_trains(env_id, in_tmp):
     rows = read_metrics(in_tmp / "runs/x")
     assert all(np.isfinite(row["return"]) for row in rows)
     assert ("level" in rows[1]) == ("curriculum" in env_id)
+
+
+def test_recipes_are_commands(tmp_path, monkeypatch):
+    """Each parses, and is not refused; nothing is run."""
+    fake = tmp_path / "python"
+    fake.write_text('#!/bin/sh\nfor x in "$@"; do printf "%s\\0" "$x"; done\n')
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
+    recipe = lambda *names: subprocess.run(
+        ["bash", ROOT / "examples/recipes.sh", *names], capture_output=True, text=True
+    )
+    names = recipe().stderr.split("names:")[1].split()
+    assert len(names) > 10
+    for name in names:
+        script, *flags = recipe(name, "--seed", "3").stdout.split("\0")[:-1]
+        module = {"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script]
+        args = module.parse_args(flags)
+        module.check(args)
+        assert args.seed == 3 and ("cpu" in name) == ("--no-cuda" in flags)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("env_id", EXAMPLES)
+def test_from_images(env_id):
+    """Cameras show the objects, and not the goal, which is in the state."""
+    from mani_skill.utils.structs import Pose
+
+    args = ppo_rgb.Args(env_id=env_id, sim_backend="physx_cpu", camera_width=64, camera_height=64, shader="minimal")
+    env = ppo_rgb.make_env(replace(args, capture_video=False), None, False)
+    task = env.unwrapped
+    obs, _ = env.reset(seed=0)
+    assert obs["rgb"].shape == (1, 64, 64, 3)
+
+    def see(actor, position):
+        """Which pixels change when this is put there; and what else is told of it."""
+        before = task.get_obs()
+        actor.set_pose(Pose.create_from_pq(position))
+        after = task.get_obs()
+        images = [x["sensor_data"]["base_camera"]["rgb"].int() for x in (before, after)]
+        told = [k for k in before["extra"] if not torch.equal(before["extra"][k], after["extra"][k])]
+        return int(((images[0] - images[1]).abs().amax(-1) > 30).sum()), told
+
+    if "clutter" in env_id:
+        changed, told = see(task.blocks[0], [0.1, 0.15, 0.1])
+    else:
+        assert see(task.goal, [-0.1, 0.1, 1e-3]) == (0, ["goal_pos"])
+        changed, told = see(task.cube, [0.1, 0.15, 0.1])
+    assert changed > 10 and not told
+    env.close()

@@ -1,0 +1,29 @@
+"""How a task's episodes start: 16 resets side by side, with seeds 0 to 15, in new scenes.
+
+python tests/benchmarks/starts.py examples.push_to_goal:PushToGoal-v1 push_to_goal.png
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+import ppo  # before mani_skill, whose software renderer it finds
+
+# isort: split
+import gymnasium as gym
+import imageio.v3 as iio
+import torch
+
+env_id, path = sys.argv[1:]
+args = ppo.Args(env_id=env_id, sim_backend="physx_cpu", render_backend="cpu")
+ppo.prepare_rendering(args)
+env = gym.make(
+    env_id, render_mode="rgb_array", render_backend=args.render_backend, sim_backend="physx_cpu",
+    human_render_camera_configs=dict(width=192, height=192),
+)  # fmt: skip
+frames = []
+for seed in range(16):
+    env.reset(seed=seed, options=dict(reconfigure=True))
+    frames.append(env.render()[0].cpu())
+rows = [torch.cat(frames[i : i + 8], dim=1) for i in (0, 8)]
+iio.imwrite(path, torch.cat(rows).numpy())
