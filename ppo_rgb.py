@@ -1618,9 +1618,11 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                     final_value = agent.get_value(to_device(infos["final_observation"], device))
                 next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
                 num_episodes += done.sum()
-                final, known = infos["final_info"], ("elapsed_steps", "success", "fail")
-                own = {k: v for k, v in final.items() if getattr(v, "ndim", 0) == 1 and k not in known}  # is_grasped, …
-                for key, value in (own | final["episode"]).items():
+                final_infos = dict(infos["final_info"]["episode"])
+                for key, value in infos["final_info"].items():  # what the task tells beside, such as is_grasped
+                    if isinstance(value, torch.Tensor) and value.shape == done.shape:
+                        final_infos[f"final_{key}"] = value
+                for key, value in final_infos.items():
                     total = torch.where(done, value.to(device).float(), 0.0).sum()
                     episode_sums[key] = episode_sums.get(key, 0.0) + total
         with torch.no_grad():

@@ -9,10 +9,10 @@ with `options={"env_idx": ...}` and nothing else, so the difficulty is added in 
 * an episode that starts from a seed has full difficulty: evaluations do so, and measure the task itself;
 * an episode of training has the level of its environment, which success raises and failure lowers three times as
   much: so it stays where three of four episodes succeed (the weighted up-down method: Kaernbach 1991, eq. 1);
-* whoever gives `options={"difficulty": d}`, with one number or (b,) of them between 0 and 1, has episodes of those.
+* whoever gives `options={"difficulty": d}` has episodes of d between 0 and 1, or in a batch of (b,) of them.
 
-`level` is in the task's infos, so that ppo.py logs it (train/level). It is not in checkpoints: a resumed run starts
-at level 0 again, and climbs within some ten episodes of each environment.
+`level` is in the task's infos, so that ppo.py logs it (train/final_level). It is not in checkpoints: a resumed run
+starts at level 0 again, climbs within some ten episodes of each environment, and is not exact with --exact_resume.
 """
 
 import numpy as np
@@ -69,22 +69,23 @@ class PushFurtherEnv(BaseEnv):
             self.level = torch.zeros(self.num_envs, device=self.device)
         self.difficulty = torch.zeros(self.num_envs, device=self.device)  # of the current episode
         self.succeeded = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)  # at some step of it
+        self.paced = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)  # whether it was of the level
 
     # --- how difficult an episode is ---
 
     def reset(self, seed=None, options=None):
         options = dict(options or {})
-        if "difficulty" not in options:
+        if not {"difficulty", "reset_to_env_states"} & options.keys():
             if seed is not None:
                 options["difficulty"] = 1.0
             else:
                 env_idx = options.get("env_idx", torch.arange(self.num_envs, device=self.device))
-                options["difficulty"] = self._paced_difficulty(env_idx)
+                options.update(difficulty=self._next_level(env_idx), paced=True)
         return super().reset(seed=seed, options=options)
 
-    def _paced_difficulty(self, env_idx):
-        change = torch.where(self.succeeded[env_idx], self.step_up, -self.step_down)
-        change[self.difficulty[env_idx] != self.level[env_idx]] = 0  # an episode from a seed says nothing of the level
+    def _next_level(self, env_idx):
+        """(b,), by how the last episode went, if it was of the level."""
+        change = torch.where(self.succeeded[env_idx], self.step_up, -self.step_down) * self.paced[env_idx]
         self.level[env_idx] = (self.level[env_idx] + change).clamp(0, 1)
         return self.level[env_idx]
 
@@ -93,6 +94,7 @@ class PushFurtherEnv(BaseEnv):
         with torch.device(self.device):
             self.table_scene.initialize(env_idx)
             self.succeeded[env_idx] = False
+            self.paced[env_idx] = options.get("paced", False)
             self.difficulty[env_idx] = torch.as_tensor(options["difficulty"], dtype=torch.float32)
 
             # the same numbers at every difficulty, which stretches what they mean: a goal 8 to 12 cm ahead of the cube

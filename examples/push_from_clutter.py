@@ -5,10 +5,11 @@
 What it teaches, beside examples/push_to_goal.py:
 
 * Placing without overlap, with ManiSkill's UniformPlacementSampler: see `_free_places`.
-* Domain randomisation. Sizes, masses, friction and colours differ between environments, and belong in `_load_scene`:
-  on a GPU they cannot change once the simulation has started (ManiSkill refuses), so a batch of a thousand environments
-  has a thousand different scenes for good. With few environments, as on a CPU, let scenes be rebuilt now and then:
-  `reconfiguration_freq` below. Poses, velocities and goals belong in `_initialize_episode`.
+* Domain randomisation. Sizes, masses and friction differ between environments, and belong in `_load_scene`: in a batch
+  on a GPU they cannot change once the simulation has started, so a thousand environments have a thousand different
+  scenes for good (colours could change; they are part of a look that is made there too). A scene of one environment, as
+  on a CPU, is rebuilt now and then instead: see `reset` and `reconfiguration_freq`, and on a GPU evaluate with
+  `--eval_reconfiguration_freq 1`. Poses, velocities and goals belong in `_initialize_episode`.
 """
 
 import sapien
@@ -40,6 +41,11 @@ class PushFromClutterEnv(BaseEnv):
             reconfiguration_freq = 20 if num_envs == 1 else 0
         super().__init__(*args, robot_uids=robot_uids, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq,
                          enhanced_determinism=enhanced_determinism, **kwargs)  # fmt: skip
+
+    def reset(self, seed=None, options=None):
+        if seed is not None and self.num_envs == 1:  # the blocks follow from the seed too
+            options = {"reconfigure": True, **(options or {})}
+        return super().reset(seed=seed, options=options)
 
     @property
     def _default_sensor_configs(self):
@@ -81,9 +87,13 @@ class PushFromClutterEnv(BaseEnv):
             builder.set_scene_idxs([i])
             builder.initial_pose = sapien.Pose(p=[0.1 * k, 0.5, half_size])  # apart from each other
             blocks.append(builder.build(name=f"block {k} of environment {i}"))
-            self.remove_from_state_dict_registry(blocks[-1])  # environment states hold the joined one
             self.half_sizes[i, k] = half_size
         joined = Actor.merge(blocks, name=f"block {k}")
+        # The scene is to know the joined one only: it loops over its actors at each reset, and saves them in states.
+        for block in blocks:
+            self.remove_from_state_dict_registry(block)
+            del self.scene.actors[block.name]
+        self.scene.actors[joined.name] = joined
         self.add_to_state_dict_registry(joined)
         return joined
 
@@ -92,7 +102,7 @@ class PushFromClutterEnv(BaseEnv):
 
         The sampler draws from torch's global generator, as often as the fullest environment of its batch needs: one
         for each environment, seeded from its own generator, keeps its episodes independent of the others."""
-        radii = half_sizes.cpu() * 2**0.5
+        radii = half_sizes * 2**0.5
         with torch.random.fork_rng(devices=[]):  # puts the global generator back afterwards
             torch.default_generator.manual_seed(int(rng.randint(2**31)))
             sampler = UniformPlacementSampler(self.region, batch_size=1)
@@ -106,7 +116,7 @@ class PushFromClutterEnv(BaseEnv):
     def _initialize_episode(self, env_idx, options):
         b = len(env_idx)
         rngs = self._batched_episode_rng[env_idx]
-        places = [self._free_places(sizes, rng) for sizes, rng in zip(self.half_sizes[env_idx], rngs.rngs)]
+        places = [self._free_places(sizes, rng) for sizes, rng in zip(self.half_sizes[env_idx].cpu(), rngs.rngs)]
         angles = rngs.uniform(0, 3.14, size=self.num_blocks)  # (b, num_blocks)
         with torch.device(self.device):
             self.table_scene.initialize(env_idx)

@@ -1,4 +1,4 @@
-"""The smallest complete task to copy: push a cube to a goal on the table, anywhere in reach.
+"""The smallest complete task to copy: push a cube to a goal ahead of it on the table.
 
     python ppo.py --env_id examples.push_to_goal:PushToGoal-v1
 
@@ -61,7 +61,9 @@ class PushToGoalEnv(BaseEnv):
             self.scene, self.goal_radius, thickness=1e-5, name="goal", body_type="kinematic", add_collision=False,
             initial_pose=sapien.Pose(p=[0.2, 0, 1e-3]),
         )  # fmt: skip
-        self._hidden_objects.append(self.goal)  # in videos, but not in what the policy's cameras see
+        self._hidden_objects.append(
+            self.goal
+        )  # from the policy's cameras, not from videos: the state tells where it is
 
     # --- how an episode starts ---
 

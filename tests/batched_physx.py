@@ -212,10 +212,13 @@ def index_in(cls, name, of, table):
 def batched_physx():
     """Within it, gym.make(task, num_envs=N, sim_backend="physx_cuda") builds N environments on the stand-in."""
     backend = BackendInfo(torch.device("cpu"), sapien.Device("cpu"), "physx_cuda", None, "none")
+    original, setup = sapien_env.parse_sim_and_render_backend, sapien_env.BaseEnv._setup_scene
+    parse = lambda sim, render: backend if sim == "physx_cuda" else original(sim, render)
+    setup_either = lambda env: (setup_scene if env.backend is backend else setup)(env)
     with (
         mock.patch.object(physx, "PhysxGpuSystem", BatchedPhysx),  # whose instances ManiSkill asks for
-        mock.patch.object(sapien_env, "parse_sim_and_render_backend", lambda *_: backend),
-        mock.patch.object(sapien_env.BaseEnv, "_setup_scene", setup_scene),
+        mock.patch.object(sapien_env, "parse_sim_and_render_backend", parse),
+        mock.patch.object(sapien_env.BaseEnv, "_setup_scene", setup_either),
         index_in(PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", "body_index"),
         index_in(Articulation, "_data_index", "_objs", "articulation_index"),
         index_in(ArticulationJoint, "_data_index", "_physx_articulations", "articulation_index"),

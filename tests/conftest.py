@@ -50,11 +50,11 @@ def pytest_terminal_summary(terminalreporter):
                 where in report.nodeid and "test_task.py" in report.nodeid
                 for report in terminalreporter.stats.get(k, ())
             )
-            for k in ("passed", "failed", "skipped")
+            for k in ("passed", "failed", "error", "skipped")
         ]
         if any(reports):
             name = "the CPU stand-in for PhysX's GPU simulation" if where == "stand-in" else "PhysX's GPU simulation"
-            counts = "{} checks of tasks passed, {} failed, {} did not run".format(*reports)
+            counts = "{} checks of tasks passed, {} failed, {} had an error, {} did not run".format(*reports)
             terminalreporter.write_line(f"on {name}: {counts}")
 
 

@@ -10,6 +10,7 @@ says where.
 import contextlib
 import os
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +24,7 @@ import ppo
 import mani_skill.envs  # noqa: F401
 from mani_skill.utils.structs import Pose
 
-NUM_ENVS = 4
+NUM_ENVS = 5
 EXAMPLES = [
     "examples.push_to_goal:PushToGoal-v1",
     "examples.push_from_clutter:PushFromClutter-v1",
@@ -39,27 +40,17 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("env_id", given or EXAMPLES + MANISKILL, scope="module")
 
 
-def has_physx_cuda():
-    if not torch.cuda.is_available():
-        return False
-    import sapien.physx
-
-    with contextlib.suppress(RuntimeError):
-        sapien.physx.enable_gpu()
-        return True
-    return False
-
-
-WHERE = ["stand-in", pytest.param("physx_cuda", marks=pytest.mark.skipif(not has_physx_cuda(), reason="no PhysX GPU"))]
-
-
 def make(env_id, **kwargs):
     return gym.make(env_id, obs_mode="state", sim_backend="physx_cuda", render_backend="none", **kwargs)
 
 
-@pytest.fixture(scope="module", params=WHERE)
+@pytest.fixture(scope="module", params=["stand-in", "physx_cuda"])
 def envs(env_id, request):
     """NUM_ENVS environments of the task in one batch."""
+    if request.param == "physx_cuda" and not (
+        torch.cuda.is_available() and [*Path.home().glob(".sapien/physx/*/libPhysX*")]
+    ):
+        pytest.skip("needs a GPU, and PhysX's library for it, which SAPIEN fetches when it first simulates there")
     with batched_physx() if request.param == "stand-in" else contextlib.nullcontext():
         env = make(env_id, num_envs=NUM_ENVS)
         yield env
@@ -70,14 +61,14 @@ def envs(env_id, request):
 
 
 def everything(env):
-    """What an episode is made of, by name: tensors (num_envs, ...)."""
+    """What an episode is made of, by name: tensors (num_envs, ...), and the task's other tensors."""
     base, parts = env.unwrapped, {}
     for name, actor in {**base.scene.actors, **base.scene.actor_views}.items():
         if len(actor._objs) == base.num_envs and actor.px_body_type != "static":
             parts[f"pose of {name}"] = actor.pose.raw_pose
             if actor.px_body_type == "dynamic":
                 parts[f"velocity of {name}"] = torch.cat([actor.linear_velocity, actor.angular_velocity], dim=1)
-    for name, robot in base.scene.articulations.items():
+    for name, robot in {**base.scene.articulations, **base.scene.articulation_views}.items():
         if len(robot._objs) == base.num_envs:
             parts |= {f"joint positions of {name}": robot.qpos, f"joint velocities of {name}": robot.qvel}
             parts |= {f"base of {name}": robot.root_pose.raw_pose}
@@ -92,7 +83,8 @@ def everything(env):
                 collect(f"{name}[{k!r}]", v)
 
     for name, value in vars(base).items():
-        collect(name, value)
+        if name not in ("_last_obs", "_init_raw_obs", "_init_raw_state", "_elapsed_steps"):  # ManiSkill's books
+            collect(name, value)
     return {name: value.clone() for name, value in parts.items()}
 
 
@@ -108,12 +100,17 @@ def play(env, steps, seed=0):
 
 
 def first_difference(a, b, rows=slice(None)):
-    for name in a.keys() | b.keys():
+    for name in a | b:
         if name not in a or name not in b or a[name].shape != b[name].shape:
             return name
-        if not torch.equal(a[name][rows], b[name][rows]):
+        if not torch.allclose(a[name][rows].double(), b[name][rows].double(), rtol=0, atol=0, equal_nan=True):
             return name
     return None
+
+
+def placed(parts):
+    """What _initialize_episode decides, ManiSkill not."""
+    return {k: v for k, v in parts.items() if k.startswith(("pose", "joint positions", "attribute"))}
 
 
 def seeds(start):
@@ -124,6 +121,8 @@ def reset_some(env, env_idx, **options):
     try:
         return env.reset(options={"env_idx": torch.tensor(env_idx, device=env.unwrapped.device), **options})
     except (RuntimeError, IndexError, ValueError, AssertionError) as error:
+        if "reconfigure" in str(error):
+            raise
         raise AssertionError(
             f"a reset of environments {env_idx} of {NUM_ENVS} fails: {error}. Whatever _initialize_episode makes must "
             "have len(env_idx) rows, not num_envs"
@@ -144,14 +143,20 @@ def check_observations(env):
 
 
 def check_seeds(env):
-    """The same seeds give the same episodes, others give others."""
+    """The same seeds give the same episodes, others give others, in each environment its own."""
+    of_episodes = lambda: {k: v for k, v in rows_of(env, everything(env)).items() if v.is_floating_point()}
     env.reset(seed=seeds(5))
-    first = everything(env)
+    first = of_episodes()
     env.reset(seed=seeds(5))
-    name = first_difference(first, everything(env))
+    name = first_difference(first, of_episodes())
     assert name is None, f"two resets with the same seeds differ in the {name}: it is drawn from an unseeded generator"
     env.reset(seed=seeds(500))
-    assert first_difference(first, everything(env)), "two seeds give the same episode: nothing is randomised"
+    other = of_episodes()
+    assert first_difference(first, other), "two seeds give the same episode: nothing is randomised"
+    for name in placed(first):
+        if not torch.equal(first[name], other[name]) and len(first[name]) > 1:
+            alike = (first[name] == first[name][0]).all()
+            assert not alike, f"the {name} is random, but the same in all environments: draw len(env_idx) rows"
 
 
 def check_everything_is_initialised(env):
@@ -174,24 +179,28 @@ def check_partial_reset(env):
         before = everything(env)
         reset_some(env, env_idx)
         after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
+        exact = hasattr(env.unwrapped.scene.px, "systems")  # the stand-in; PhysX may compute last bits anew
         for name in rows_of(env, before):
             assert before[name].shape == after[name].shape, (
                 f"the {name} has shape {tuple(after[name].shape)} after a reset of environments {env_idx}: write to "
                 "its rows, [env_idx]"
             )
-            assert torch.equal(before[name][others], after[name][others]), (
-                f"a reset of environments {env_idx} changes the {name} of environments {others}: env_idx is ignored"
-            )
+            assert torch.allclose(
+                before[name][others].double(), after[name][others].double(), atol=0 if exact else 1e-5, equal_nan=True
+            ), f"a reset of environments {env_idx} changes the {name} of environments {others}: env_idx is ignored"
+        before, after = [placed(rows_of(env, parts)) for parts in (before, after)]
         assert first_difference(before, after, env_idx), f"a reset of environments {env_idx} does nothing"
 
 
 def check_overlap(env, resets=1000, tolerance=2e-3):
     """No free object starts inside another, by PhysX's own contacts; only where the stand-in simulates."""
-    env.reset(seed=seeds(10_000))
-    systems = env.unwrapped.scene.px.systems
+    _, info = env.reset(seed=seeds(10_000))
+    solved = 0
     for k in range(resets // NUM_ENVS):
-        for i, system in enumerate(systems):
-            free = set(system.rigid_dynamic_components)
+        if "success" in info:
+            solved += int(info["success"].sum())
+        for i, system in enumerate(env.unwrapped.scene.px.systems):
+            free = {body for body in system.rigid_dynamic_components if not body.kinematic}
             system.step()
             for contact in system.get_contacts():
                 if free & set(contact.bodies):
@@ -200,7 +209,8 @@ def check_overlap(env, resets=1000, tolerance=2e-3):
                     assert depth < tolerance, (
                         f"{names} overlap by {1000 * depth:.0f} mm in reset {k} of environment {i}"
                     )
-        env.reset()
+        _, info = env.reset()
+    assert solved <= resets / 20, f"{solved} of {resets} episodes start in success"
 
 
 def check_options(env):
@@ -223,7 +233,12 @@ def check_restoring_states(env):
     """reset_to_env_states gives back exactly what was, without _initialize_episode."""
     env.reset(seed=seeds(5))
     play(env, 5)
-    read = lambda: {k: v for part in env.unwrapped.get_state_dict().values() for k, v in part.items()}
+
+    def flatten(tree, prefix=""):
+        parts = [flatten(v, f"{prefix}{k} ") if isinstance(v, dict) else {prefix + k: v} for k, v in tree.items()]
+        return {k: v for part in parts for k, v in part.items() if not k.startswith("controller")}  # not restored
+
+    read = lambda: flatten(env.unwrapped.get_state_dict())
     rows = lambda tree, i: {k: rows(v, i) for k, v in tree.items()} if isinstance(tree, dict) else tree[i]
     state, flat, expected = env.unwrapped.get_state_dict(), read(), everything(env)
     play(env, 5)
@@ -238,22 +253,29 @@ def check_restoring_states(env):
         play(env, 5)
         before = read()
         env.reset(options=dict(env_idx=env_idx, reset_to_env_states=dict(env_states=rows(state, env_idx))))
+        others = [i for i in range(NUM_ENVS) if i not in (1, 3)]
         for name, after in read().items():
             assert torch.allclose(after[[1, 3]], flat[name][[1, 3]], atol=1e-5), f"not restored: {name} of [1, 3]"
-            assert torch.equal(after[[0, 2]], before[name][[0, 2]]), f"restoring [1, 3] changes {name} of [0, 2]"
+            assert torch.allclose(after[others], before[name][others], atol=1e-5), f"restoring [1, 3] changes {name}"
     finally:
         del env.unwrapped._initialize_episode
 
 
 def check_rewards(env_id, steps=60):
-    """Normalised dense rewards are within [0, 1], dense ones bounded; random actions do not always succeed."""
+    """Normalised dense rewards are within [0, 1], in success too, dense ones bounded; random actions do not always
+    succeed."""
     modes = ppo.find_task(env_id).cls.SUPPORTED_REWARD_MODES
     for mode in [mode for mode in ("normalized_dense", "dense") if mode in modes]:
         env = make(env_id, num_envs=NUM_ENVS, reward_mode=mode)
         env.reset(seed=seeds(3))
         succeeded, rng = torch.zeros(NUM_ENVS, dtype=torch.bool), np.random.default_rng(0)
         for _ in range(steps):
-            obs, reward, *_, info = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            obs, reward, *_, info = env.step(action)
+            if "success" in info:
+                won = {**info, "success": torch.ones_like(info["success"])}
+                won = env.unwrapped.get_reward(obs=obs, action=torch.as_tensor(action, device=obs.device), info=won)
+                reward = torch.cat([reward, won])
             assert torch.isfinite(obs).all() and torch.isfinite(reward).all(), "random actions give what is not finite"
             low, high = (-1e-5, 1 + 1e-5) if mode == "normalized_dense" else (-1e3, 1e3)
             assert ((reward >= low) & (reward <= high)).all(), f"{mode} reward {reward.tolist()}"
