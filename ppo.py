@@ -1049,7 +1049,7 @@ def check(args: Args) -> None:
     try:
         parse_backends(args.sim_backend, args.render_backend)
     except (KeyError, ValueError, RuntimeError) as error:
-        fail(f"--render_backend {args.render_backend}: {error}; use gpu, gpu:N, cpu or none")
+        fail(f"--render_backend {args.render_backend}: {error}; --help lists what there is")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install wandb")
 

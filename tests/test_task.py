@@ -13,7 +13,6 @@ import sys
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from batched_physx import batched_physx
@@ -22,6 +21,7 @@ import ppo
 
 # isort: split
 import mani_skill.envs  # noqa: F401
+from mani_skill.utils import common
 from mani_skill.utils.structs import Pose
 
 NUM_ENVS = 5
@@ -94,9 +94,12 @@ def rows_of(env, parts):
 
 
 def play(env, steps, seed=0):
-    rng = np.random.default_rng(seed)
+    """Random actions; returns what the last of them gave, and it."""
+    env.action_space.seed(seed)
     for _ in range(steps):
-        env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        action = env.action_space.sample()
+        result = env.step(action)
+    return *result, action
 
 
 def first_difference(a, b, rows=slice(None)):
@@ -139,7 +142,7 @@ def check_observations(env):
     for step in range(10):
         assert tuple(obs.shape[1:]) == space.shape, f"observations {tuple(obs.shape[1:])}, declared {space.shape}"
         assert torch.isfinite(obs).all(), f"an observation is not finite {step} steps after the reset"
-        obs = env.step(env.action_space.sample())[0]
+        obs = play(env, 1, seed=step)[0]
 
 
 def check_seeds(env):
@@ -268,13 +271,13 @@ def check_rewards(env_id, steps=60):
     for mode in [mode for mode in ("normalized_dense", "dense") if mode in modes]:
         env = make(env_id, num_envs=NUM_ENVS, reward_mode=mode)
         env.reset(seed=seeds(3))
-        succeeded, rng = torch.zeros(NUM_ENVS, dtype=torch.bool), np.random.default_rng(0)
-        for _ in range(steps):
-            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-            obs, reward, *_, info = env.step(action)
+        succeeded = torch.zeros(NUM_ENVS, dtype=torch.bool)
+        for step in range(steps):
+            obs, reward, *_, info, action = play(env, 1, seed=step)
             if "success" in info:
                 won = {**info, "success": torch.ones_like(info["success"])}
-                won = env.unwrapped.get_reward(obs=obs, action=torch.as_tensor(action, device=obs.device), info=won)
+                action = common.to_tensor(action, device=obs.device)
+                won = env.unwrapped.get_reward(obs=obs, action=action, info=won)
                 reward = torch.cat([reward, won])
             assert torch.isfinite(obs).all() and torch.isfinite(reward).all(), "random actions give what is not finite"
             low, high = (-1e-5, 1 + 1e-5) if mode == "normalized_dense" else (-1e3, 1e3)
@@ -290,7 +293,7 @@ def check_autoreset(env_id):
     envs.reset(seed=seeds(3))
     ended = torch.zeros(NUM_ENVS, dtype=torch.bool)
     for _ in range(14):
-        obs, *_, infos = envs.step(torch.as_tensor(envs.action_space.sample()))
+        obs, *_, infos = envs.step(common.to_tensor(envs.action_space.sample(), device=envs.device))
         if "final_observation" in infos:
             done = infos["_final_info"]
             same = (infos["final_observation"][done] == obs[done]).all(dim=1)
