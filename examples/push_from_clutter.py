@@ -101,7 +101,8 @@ class PushFromClutterEnv(BaseEnv):
         """Centres (n, 2) of n blocks that do not overlap, however they are turned; nan for one that finds no place.
 
         The sampler draws from torch's global generator, as often as the fullest environment of its batch needs: one
-        for each environment, seeded from its own generator, keeps its episodes independent of the others."""
+        for each environment, seeded from its own generator, keeps its episodes independent of the others. It takes
+        about a millisecond for each environment that resets."""
         radii = half_sizes * 2**0.5
         with torch.random.fork_rng(devices=[]):  # puts the global generator back afterwards
             torch.default_generator.manual_seed(int(rng.randint(2**31)))
