@@ -465,7 +465,7 @@ import os, signal
 from mani_skill.envs.tasks import PushCubeEnv
 from mani_skill.utils.registration import register_env
 
-@register_env("Fragile-v1", max_episode_steps=50)
+@register_env("{name}-v1", max_episode_steps=50)
 class Fragile(PushCubeEnv):
     steps = 0
 
@@ -477,25 +477,26 @@ class Fragile(PushCubeEnv):
 """
 
 
-def test_error_of_a_task(tmp_path):
-    (tmp_path / "fragile.py").write_text(FRAGILE.format(fault="raise ValueError('my own mistake')"))
-    flags = (*TINY, "--env_id", "fragile:Fragile-v1", "--num_eval_episodes", 1)  # which has 50 of the 60 steps
-    process = run_script(*flags, cwd=tmp_path, env={**NO_VULKAN, "PYTHONPATH": str(tmp_path)}, timeout=120)
-    message = r"(?s)worker \d .*failed:.*fragile.py.*ValueError: my own mistake"
-    assert process.returncode == 1 and re.search(message, process.stderr), process.stderr
-    assert "last.pt is safe" in process.stderr and process.stderr.count("Traceback") == 1
+def test_error_of_a_task(in_tmp, monkeypatch, capfd):
+    Path("mistaken.py").write_text(FRAGILE.format(name="Mistaken", fault="raise ValueError('my own mistake')"))
+    monkeypatch.syspath_prepend(in_tmp)
+    flags = (*TINY, "--env_id", "mistaken:Mistaken-v1", "--num_eval_episodes", 1)  # which has 50 of the 60 steps
+    assert ppo.main([*map(str, flags)]) == 1
+    errors = capfd.readouterr().err
+    assert re.search(r"(?s)worker \d .*failed:.*mistaken.py.*ValueError: my own mistake", errors), errors
+    assert "last.pt is safe" in errors and errors.count("Traceback") == 1
 
 
-def test_physics_that_explode_are_survived(tmp_path):
+def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd):
     """A cube at nowhere in one environment of the real simulator: one update is skipped, then training goes on."""
     fault = "self.cube if 0 else self.obj.set_pose(Pose.create_from_pq(torch.full((1, 3), float('nan'))))"
-    source = "import torch\nfrom mani_skill.utils.structs import Pose\n" + FRAGILE.format(fault=fault)
-    (tmp_path / "fragile.py").write_text(source)
-    flags = (*TINY, "--env_id", "fragile:Fragile-v1", "--num_steps", 30, "--total_timesteps", 720)
-    process = run_script(*flags, cwd=tmp_path, env={**NO_VULKAN, "PYTHONPATH": str(tmp_path)}, timeout=120)
-    assert process.returncode == 0, process.stderr
-    skipped = [row["update_skipped"] for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "train"]
-    assert len(skipped) == 6 and sum(skipped) == 1, process.stdout
+    source = "import torch\nfrom mani_skill.utils.structs import Pose\n" + FRAGILE.format(name="Exploding", fault=fault)
+    Path("exploding.py").write_text(source)
+    monkeypatch.syspath_prepend(in_tmp)
+    flags = (*TINY, "--env_id", "exploding:Exploding-v1", "--num_steps", 30, "--total_timesteps", 720)
+    assert ppo.main([*map(str, flags)]) == 0
+    skipped = [row["update_skipped"] for row in read_metrics(in_tmp / "runs/x") if row["kind"] == "train"]
+    assert len(skipped) == 6 and sum(skipped) == 1, capfd.readouterr()
 
 
 @pytest.mark.slow
