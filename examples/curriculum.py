@@ -123,18 +123,26 @@ class PushFurtherEnv(BaseEnv):
 
     def _get_obs_extra(self, info):
         obs = dict(tcp_pose=self.agent.tcp.pose.raw_pose, goal_pos=self.goal.pose.p)
-        if self.obs_mode_struct.use_state:
-            obs.update(cube_pose=self.cube.pose.raw_pose, cube_to_goal=self.goal.pose.p - self.cube.pose.p)
+        if self.obs_mode_struct.use_state:  # else the cameras show the cube
+            cube, push_from = self.cube.pose, self.push_from()
+            obs.update(
+                cube_pose=cube.raw_pose, cube_to_goal=self.goal.pose.p - cube.p,
+                tcp_to_push_from=push_from - self.agent.tcp.pose.p,
+            )  # fmt: skip
         return obs
 
-    def compute_dense_reward(self, obs, action, info):
-        cube, goal = self.cube.pose.p, self.goal.pose.p
-        to_goal = goal - cube
+    def push_from(self):
+        """Where to push from, (num_envs, 3): behind the cube, as the goal sees it."""
+        cube = self.cube.pose.p
+        to_goal = self.goal.pose.p - cube
         to_goal[:, 2] = 0
-        distance = torch.linalg.norm(to_goal, dim=1)
-        push_from = cube - (self.cube_half_size + 0.02) * to_goal / distance.clamp(min=1e-6)[:, None]
-        reach = 1 - torch.tanh(5 * torch.linalg.norm(push_from - self.agent.tcp.pose.p, dim=1))
-        reward = reach + 1 - torch.tanh(5 * distance)
+        return cube - (self.cube_half_size + 0.02) * torch.nn.functional.normalize(to_goal, dim=1)
+
+    def compute_dense_reward(self, obs, action, info):
+        """Between 0 and 3: at the place to push from, 1; the cube at the goal, 1; success, 3."""
+        reach = torch.linalg.norm(self.push_from() - self.agent.tcp.pose.p, dim=1)
+        push = torch.linalg.norm(self.goal.pose.p[:, :2] - self.cube.pose.p[:, :2], dim=1)
+        reward = 2 - torch.tanh(5 * reach) - torch.tanh(5 * push)
         reward[info["success"]] = 3
         return reward
 
