@@ -16,55 +16,21 @@ starts at level 0 again, climbs within some ten episodes of each environment, an
 """
 
 import numpy as np
-import sapien
 import torch
-from mani_skill.agents.robots import Panda
-from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
-from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Pose
+
+from examples.push_to_goal import PushToGoalEnv
 
 
 @register_env("PushFurther-v1", max_episode_steps=50)
-class PushFurtherEnv(BaseEnv):
-    SUPPORTED_ROBOTS = ["panda"]
-    agent: Panda
+class PushFurtherEnv(PushToGoalEnv):
+    """Scene, observations and reward are those of push_to_goal.py."""
 
-    cube_half_size = 0.02  # metres
-    goal_radius = 0.05
     step_up, step_down = 0.1, 0.3  # of an environment's level, after success and failure
 
-    def __init__(self, *args, robot_uids="panda", enhanced_determinism=True, **kwargs):
-        super().__init__(*args, robot_uids=robot_uids, enhanced_determinism=enhanced_determinism, **kwargs)
-
-    @property
-    def _default_sensor_configs(self):
-        pose = sapien_utils.look_at(eye=[0.5, 0, 0.5], target=[0.0, 0, 0.0])
-        return [CameraConfig("base_camera", pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
-
-    @property
-    def _default_human_render_camera_configs(self):
-        pose = sapien_utils.look_at(eye=[0.5, 0.4, 0.45], target=[0.0, 0.0, 0.05])
-        return CameraConfig("render_camera", pose, width=512, height=512, fov=0.9, near=0.01, far=10)
-
-    def _load_agent(self, options):
-        super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
-
     def _load_scene(self, options):
-        self.table_scene = TableSceneBuilder(self, robot_init_qpos_noise=0.02)
-        self.table_scene.build()
-        self.cube = actors.build_cube(
-            self.scene, self.cube_half_size, color=[0.05, 0.2, 0.6, 1], name="cube",
-            initial_pose=sapien.Pose(p=[0, 0, self.cube_half_size]),
-        )  # fmt: skip
-        self.goal = actors.build_red_white_target(
-            self.scene, self.goal_radius, thickness=1e-5, name="goal", body_type="kinematic", add_collision=False,
-            initial_pose=sapien.Pose(p=[0.2, 0, 1e-3]),
-        )  # fmt: skip
-        self._hidden_objects.append(self.goal)
+        super()._load_scene(options)
         if not hasattr(self, "level"):  # it outlives the scene
             self.level = torch.zeros(self.num_envs, device=self.device)
         self.difficulty = torch.zeros(self.num_envs, device=self.device)  # of the current episode
@@ -112,39 +78,7 @@ class PushFurtherEnv(BaseEnv):
             p[:, 2] = 1e-3
             self.goal.set_pose(Pose.create_from_pq(p, [np.sqrt(0.5), 0, np.sqrt(0.5), 0]))
 
-    # --- success, observation, reward: as in push_to_goal.py ---
-
     def evaluate(self):
-        to_goal = self.goal.pose.p[:, :2] - self.cube.pose.p[:, :2]
-        fell = self.cube.pose.p[:, 2] < 0
-        success = (torch.linalg.norm(to_goal, dim=1) < self.goal_radius) & ~fell
-        self.succeeded |= success
-        return {"success": success, "fail": fell, "level": self.level.clone()}
-
-    def _get_obs_extra(self, info):
-        obs = dict(tcp_pose=self.agent.tcp.pose.raw_pose, goal_pos=self.goal.pose.p)
-        if self.obs_mode_struct.use_state:  # else the cameras show the cube
-            cube, push_from = self.cube.pose, self.push_from()
-            obs.update(
-                cube_pose=cube.raw_pose, cube_to_goal=self.goal.pose.p - cube.p,
-                tcp_to_push_from=push_from - self.agent.tcp.pose.p,
-            )  # fmt: skip
-        return obs
-
-    def push_from(self):
-        """Where to push from, (num_envs, 3): behind the cube, as the goal sees it."""
-        cube = self.cube.pose.p
-        to_goal = self.goal.pose.p - cube
-        to_goal[:, 2] = 0
-        return cube - (self.cube_half_size + 0.02) * torch.nn.functional.normalize(to_goal, dim=1)
-
-    def compute_dense_reward(self, obs, action, info):
-        """Between 0 and 3: at the place to push from, 1; the cube at the goal, 1; success, 3."""
-        reach = torch.linalg.norm(self.push_from() - self.agent.tcp.pose.p, dim=1)
-        push = torch.linalg.norm(self.goal.pose.p[:, :2] - self.cube.pose.p[:, :2], dim=1)
-        reward = 2 - torch.tanh(5 * reach) - torch.tanh(5 * push)
-        reward[info["success"]] = 3
-        return reward
-
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 3
+        info = super().evaluate()
+        self.succeeded |= info["success"]
+        return {**info, "level": self.level.clone()}

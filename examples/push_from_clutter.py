@@ -14,51 +14,33 @@ What it teaches, beside examples/push_to_goal.py:
 
 import sapien
 import torch
-from mani_skill.agents.robots import Panda
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.samplers import UniformPlacementSampler
-from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 from sapien.physx import PhysxMaterial
 
+from examples.push_to_goal import PushToGoalEnv
+
 
 @register_env("PushFromClutter-v1", max_episode_steps=50)
-class PushFromClutterEnv(BaseEnv):
-    SUPPORTED_ROBOTS = ["panda"]
-    agent: Panda
+class PushFromClutterEnv(PushToGoalEnv):
+    """Robot and cameras are those of push_to_goal.py."""
 
     num_blocks = 5  # the red one and four others
     region = ((-0.12, -0.2), (0.12, 0.2))  # of the blocks' centres: lowest and highest x and y
     line = 0.2  # x of the line
 
-    def __init__(self, *args, robot_uids="panda", num_envs=1, reconfiguration_freq=None, enhanced_determinism=True,
-                 **kwargs):  # fmt: skip
+    def __init__(self, *args, num_envs=1, reconfiguration_freq=None, **kwargs):
         if reconfiguration_freq is None:  # other blocks after so many episodes, where a scene holds one environment
             reconfiguration_freq = 20 if num_envs == 1 else 0
-        super().__init__(*args, robot_uids=robot_uids, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq,
-                         enhanced_determinism=enhanced_determinism, **kwargs)  # fmt: skip
+        super().__init__(*args, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq, **kwargs)
 
     def reset(self, seed=None, options=None):
         if seed is not None and self.num_envs == 1:  # the blocks follow from the seed too
             options = {"reconfigure": True, **(options or {})}
         return super().reset(seed=seed, options=options)
-
-    @property
-    def _default_sensor_configs(self):
-        pose = sapien_utils.look_at(eye=[0.5, 0, 0.5], target=[0.0, 0, 0.0])
-        return [CameraConfig("base_camera", pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
-
-    @property
-    def _default_human_render_camera_configs(self):
-        pose = sapien_utils.look_at(eye=[0.5, 0.4, 0.45], target=[0.0, 0.0, 0.05])
-        return CameraConfig("render_camera", pose, width=512, height=512, fov=0.9, near=0.01, far=10)
-
-    def _load_agent(self, options):
-        super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
 
     def _load_scene(self, options):
         self.table_scene = TableSceneBuilder(self, robot_init_qpos_noise=0.02)
@@ -153,6 +135,3 @@ class PushFromClutterEnv(BaseEnv):
         reward = reach + push
         reward[info["success"]] = 3
         return reward
-
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 3

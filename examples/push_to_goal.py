@@ -61,9 +61,7 @@ class PushToGoalEnv(BaseEnv):
             self.scene, self.goal_radius, thickness=1e-5, name="goal", body_type="kinematic", add_collision=False,
             initial_pose=sapien.Pose(p=[0.2, 0, 1e-3]),
         )  # fmt: skip
-        self._hidden_objects.append(
-            self.goal
-        )  # from the policy's cameras, not from videos: the state tells where it is
+        self._hidden_objects.append(self.goal)  # from the policy's cameras, not from videos; the state has it
 
     # --- how an episode starts ---
 

@@ -24,6 +24,7 @@ import mani_skill.envs  # noqa: F401
 from mani_skill.utils import common
 from mani_skill.utils.structs import Pose
 
+sys.path.insert(0, os.getcwd())  # where your module lies
 NUM_ENVS = 5
 EXAMPLES = [
     "examples.push_to_goal:PushToGoal-v1",
@@ -36,7 +37,6 @@ MANISKILL = ["PushCube-v1", "PickCube-v1", "StackCube-v1", "MS-CartpoleBalance-v
 def pytest_generate_tests(metafunc):
     if "env_id" in metafunc.fixturenames:
         given = metafunc.config.getoption("--env_id")
-        sys.path.insert(0, os.getcwd())
         metafunc.parametrize("env_id", given or EXAMPLES + MANISKILL, scope="module")
 
 
