@@ -197,13 +197,13 @@ def test_broken_copies_are_found(stand_in, fault, tmp_path, monkeypatch):
     source = source.replace(right, wrong).replace("PushToGoal-v1", "Broken-v1")
     if "self.other" in wrong:
         source = source.replace("    # --- how an episode starts ---", OTHER_CUBE)
-    (tmp_path / "broken.py").write_text(source)
+    (tmp_path / "spoiled.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
-    monkeypatch.delitem(importlib.sys.modules, "broken", raising=False)
+    monkeypatch.delitem(importlib.sys.modules, "spoiled", raising=False)
     for registry in (gym.registry, ppo.REGISTERED_ENVS):
         registry.pop("Broken-v1", None)
-    env = make("broken:Broken-v1", num_envs=NUM_ENVS)
+    env = make("spoiled:Broken-v1", num_envs=NUM_ENVS)
     with pytest.raises(AssertionError, match=message):
         for check in (test_task.check_seeds, test_task.check_everything_is_initialised, test_task.check_partial_reset):
             check(env)
