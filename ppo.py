@@ -14,6 +14,7 @@
 """PPO for ManiSkill from state observations, in one file.
 
 Train     python ppo.py --env_id PushCube-v1
+On N GPUs torchrun --nproc_per_node=N ppo.py --env_id PushCube-v1
 Resume    python ppo.py --resume runs/NAME
 Evaluate  python ppo.py --evaluate --checkpoint runs/NAME/best.pt
 Watch     runs/NAME/videos/*.mp4, runs/NAME/learning_curve.png, tensorboard --logdir runs
@@ -40,6 +41,7 @@ import re
 import shlex
 import signal
 import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -52,7 +54,7 @@ from typing import Literal, NoReturn, Optional
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
-    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision"
+    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True"
 )
 
 import gymnasium as gym
@@ -61,6 +63,7 @@ import psutil
 import sapien
 import sapien.wrapper.urdf_loader
 import torch
+import torch.distributed as dist
 import torch.multiprocessing as mp
 import torch.nn as nn
 import tyro
@@ -82,6 +85,8 @@ def find_render_device() -> Optional[sapien.Device]:
 
 SCRIPT = Path(__file__)
 RENDER_DEVICE = find_render_device()
+RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RANK", 0))  # as torchrun tells
+WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
 MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
 
@@ -266,9 +271,9 @@ class Args:
 
     # --- runtime ---
     compile: bool = False
-    """accepted, has no effect yet"""
-    cudagraphs: bool = False
-    """accepted, has no effect yet"""
+    """compile the network with torch.compile, which takes a minute"""
+    cudagraphs: bool = True
+    """on a GPU, launch an epoch of the update, and a step of the policy, as one CUDA graph each"""
 
     @property
     def batch_size(self) -> int:
@@ -281,6 +286,17 @@ class Args:
     @property
     def num_iterations(self) -> int:
         return self.total_timesteps // self.batch_size
+
+    def share(self) -> "Args":
+        """Those of one of the processes that torchrun started: its part of the environments, on its own GPU."""
+        if WORLD_SIZE == 1:
+            return self
+        backend = self.sim_backend + f":{LOCAL_RANK}" * (self.sim_backend == "physx_cuda")
+        return replace(
+            self, num_envs=self.num_envs // WORLD_SIZE, num_eval_envs=math.ceil(self.num_eval_envs / WORLD_SIZE),
+            num_eval_episodes=math.ceil(self.num_eval_episodes / WORLD_SIZE), sim_backend=backend,
+            **dict.fromkeys(() if RANK == 0 else ("capture_video", "save_trajectory", "save_model", "track"), False),
+        )  # fmt: skip
 
 
 CPU_DEFAULTS = dict(
@@ -301,7 +317,8 @@ MAY_CHANGE = OF_THE_MACHINE | {
 
 def fail(message: str) -> NoReturn:
     """Refuse bad input: one line, exit code 2."""
-    print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
+    if LOCAL_RANK == 0:  # what is wrong is wrong in all processes
+        print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -310,7 +327,36 @@ class RunError(RuntimeError):
 
 
 def num_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    """Of this machine, for this process."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, cores // LOCAL_WORLD_SIZE)
+
+
+@contextlib.contextmanager
+def together():
+    """With the other processes that train together; RunError where one of them is gone."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise RunError(f"rank {RANK} lost another process of the run, which may have said why: {error}") from None
+
+
+def average(x: torch.Tensor) -> torch.Tensor:
+    """Mean of a tensor over the processes that train together, in place."""
+    if WORLD_SIZE > 1:
+        with together():
+            dist.all_reduce(x)
+        x /= WORLD_SIZE
+    return x
+
+
+def gather(x) -> list:
+    """What each of the processes that train together has, in the order of their ranks."""
+    everything = [x] * WORLD_SIZE
+    if WORLD_SIZE > 1:
+        with together():
+            dist.all_gather_object(everything, x)
+    return everything
 
 
 def parse_args(argv: list[str]) -> Args:
@@ -332,7 +378,8 @@ def parse_args(argv: list[str]) -> Args:
     args = parse([arg for arg in argv if arg not in ("-h", "--help")], Args())
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
-        default = replace(default, **CPU_DEFAULTS, num_envs=8 * num_cores(), num_eval_envs=4 * num_cores())
+        cores = num_cores() * WORLD_SIZE
+        default = replace(default, **CPU_DEFAULTS, num_envs=8 * cores, num_eval_envs=4 * cores)
     if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
@@ -546,8 +593,13 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
         env.close()
 
 
-def to_device(obs, device):
-    return {k: v.to(device) for k, v in obs.items()} if isinstance(obs, dict) else obs.to(device)
+def to_device(x, device):
+    """A tensor, or a dict of them, on the device; from the CPU without waiting for it."""
+    if isinstance(x, dict):
+        return {k: to_device(v, device) for k, v in x.items()}
+    if x.device.type == "cpu" and device.type == "cuda":
+        return x.pin_memory().to(device, non_blocking=True)
+    return x.to(device)
 
 
 class CPUVectorEnv(gym.Env):
@@ -749,11 +801,13 @@ class Agent(nn.Module):
     @torch.no_grad()
     def update_normalization(self, obs):
         """Merge the mean and variance of a batch of observations into the running ones (Chan et al. 1979)."""
-        count = self.obs_count + len(obs)
-        delta = obs.mean(0) - self.obs_mean
-        m2 = self.obs_var * self.obs_count + obs.var(0, correction=0) * len(obs)
-        self.obs_var.copy_((m2 + delta**2 * self.obs_count * len(obs) / count) / count)
-        self.obs_mean.add_(delta * len(obs) / count)
+        n = len(obs) * WORLD_SIZE
+        mean = average(obs.mean(0))
+        var = average(((obs - mean) ** 2).mean(0))
+        count, delta = self.obs_count + n, mean - self.obs_mean
+        m2 = self.obs_var * self.obs_count + var * n
+        self.obs_var.copy_((m2 + delta**2 * self.obs_count * n / count) / count)
+        self.obs_mean.add_(delta * n / count)
         self.obs_count.copy_(count)
 
     def get_value(self, obs):
@@ -769,8 +823,8 @@ class Agent(nn.Module):
         features = self.actor_features(obs)
         mean = self.actor_mean(features)
         policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
-        if action is None:
-            action = policy.sample()
+        if action is None:  # not policy.sample(), for which the host waits: torch.normal looks at the deviations
+            action = mean + policy.stddev * torch.randn_like(mean)
         if self.critic_features is not self.actor_features:
             features = self.critic_features(obs)
         value = self.critic(features).squeeze(-1)
@@ -828,14 +882,16 @@ KL = UPDATE_METRICS.index("approx_kl")
 
 
 def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values) -> torch.Tensor:
-    """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows.
+    """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows, in
+    each of the processes that train together: the step is that of all their rows.
 
     Returns the UPDATE_METRICS of the minibatch, one tensor on the device."""
     _, newlogprob, entropy, newvalue = agent.get_action_and_value(obs, actions)
     logratio = newlogprob - logprobs
     ratio = logratio.exp()
     if args.norm_adv:
-        advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        advantages = advantages - average(advantages.mean())
+        advantages = advantages / (average((advantages**2).mean()).sqrt() + 1e-8)
 
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
@@ -849,6 +905,9 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
 
     optimizer.zero_grad()
     loss.backward()
+    if WORLD_SIZE > 1:  # all gradients in one message
+        grads = [p.grad for p in agent.parameters() if p.grad is not None]
+        nn.utils.vector_to_parameters(average(nn.utils.parameters_to_vector(grads)), grads)
     grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     optimizer.step()
 
@@ -856,6 +915,35 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
         approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
+
+
+def as_cuda_graph(function, enabled: bool):
+    """`function`, launched as one CUDA graph: a network so small computes faster than its kernels can be launched one
+    by one.
+
+    It takes no arguments, never makes the host wait, and finds the tensors that it reads and writes always in the same
+    place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
+    as capturing wants it; the next one captures it, and those after that replay."""
+    if not enabled:
+        return function
+    graph, stream, num_calls, result = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None
+
+    def launch():
+        nonlocal num_calls, result
+        num_calls += 1
+        if num_calls <= 3:
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                result = function()
+            torch.cuda.current_stream().wait_stream(stream)
+            return result
+        if num_calls == 4:
+            with torch.cuda.graph(graph):
+                result = function()
+        graph.replay()
+        return result
+
+    return launch
 
 
 # ----- Evaluation -----------------------------------------------------------------------------------------------------
@@ -866,12 +954,14 @@ def evaluate(
     agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
 ) -> dict[str, torch.Tensor]:
     """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k (on a
-    GPU ManiSkill draws those of a batch from its first seed).
+    GPU ManiSkill draws those of a batch from its first seed). Of several processes, each runs `num_episodes`, of seeds
+    that follow on each other.
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
-    float tensor (num_episodes,) each, on the CPU."""
+    float tensor (num_episodes of all processes,) each, on the CPU."""
     low, high = action_bounds(envs, device)
     rounds = []
+    seed += RANK * num_episodes
     seed_all(seed)  # for tasks that draw during an episode
     for first in range(seed, seed + num_episodes, envs.num_envs):
         obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
@@ -886,7 +976,11 @@ def evaluate(
             for k, v in (infos["episode"] | at_end).items():
                 episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
         rounds.append(episodes)
-    return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"}
+    share = {
+        k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"
+    }
+    parts = gather(share)
+    return {k: torch.cat([part[k] for part in parts]) for k in share}
 
 
 def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
@@ -906,6 +1000,7 @@ def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
 
 CHECKPOINT_KEYS = {
     "agent", "optimizer", "iteration", "global_step", "best_score", "metrics_size", "wandb_id", "args", "versions",
+    "world_size",
 }  # fmt: skip
 
 
@@ -1021,7 +1116,11 @@ def check(args: Args) -> None:
         for flag in flags.split():
             if getattr(args, flag) is not None and not low <= getattr(args, flag) <= high:
                 fail(f"--{flag} {getattr(args, flag)}: must lie between {low:g} and {high:g}")
-    if args.batch_size < args.num_minibatches:
+    if args.num_envs % WORLD_SIZE:
+        fail(f"--num_envs {args.num_envs} cannot be shared out equally among {WORLD_SIZE} processes")
+    if WORLD_SIZE > 1 and args.evaluate:
+        fail("--evaluate is for one process: leave out torchrun")
+    if args.batch_size < args.num_minibatches * WORLD_SIZE:
         fail(f"--num_minibatches {args.num_minibatches} is more than the {args.batch_size} steps of an iteration")
     if not args.evaluate and args.num_iterations < 1:
         fail(f"--total_timesteps {args.total_timesteps} is less than one iteration of {args.batch_size} steps")
@@ -1032,11 +1131,15 @@ def check(args: Args) -> None:
     if not re.fullmatch(r"physx_cpu|physx_cuda(:\d+)?", args.sim_backend):
         fail(f"--sim_backend {args.sim_backend}: use auto, physx_cpu, physx_cuda or physx_cuda:N")
     on_gpu = args.sim_backend != "physx_cpu"
+    if args.cuda and 0 < torch.cuda.device_count() < LOCAL_WORLD_SIZE:
+        fail(f"torchrun started {LOCAL_WORLD_SIZE} processes, and there are {torch.cuda.device_count()} GPUs: one each")
+    if WORLD_SIZE > 1 and args.sim_backend.startswith("physx_cuda:"):
+        fail(f"--sim_backend {args.sim_backend}: with torchrun each process takes a GPU of its own: physx_cuda")
     if on_gpu and not args.cuda:
         fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
     if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
         try:
-            torch.zeros(1, device=choose_device(args) if on_gpu else "cuda")
+            torch.zeros(1, device=choose_device(args.share()) if on_gpu else "cuda")
             if on_gpu:
                 sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
@@ -1135,7 +1238,7 @@ def choose_device(args: Args) -> torch.device:
     """Where the agent learns: with the simulation on its GPU, else on any GPU there is, else on the CPU."""
     if args.sim_backend.startswith("physx_cuda"):
         return torch.device(args.sim_backend.replace("physx_", ""))
-    return torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+    return torch.device(f"cuda:{LOCAL_RANK}" if args.cuda and torch.cuda.is_available() else "cpu")
 
 
 def summary(metrics: dict) -> list[str]:
@@ -1200,21 +1303,33 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     # --- environments, agent ---
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
-    run_dir, device = find_run_dir(args), choose_device(args)
+    run_dir = find_run_dir(args)
     given = asdict(args)  # before videos are switched off: a resumed run may find the renderer that this one lacks
     prepare_rendering(args)
+    share = args.share()
+    device = choose_device(share)
     resumed = load_checkpoint(args.resume) if args.resume else {}
+    size = resumed.get("world_size", WORLD_SIZE)
+    if size != WORLD_SIZE:
+        fail(f"--resume: the run has {size} processes, not {WORLD_SIZE}: torchrun --nproc_per_node={size} ...")
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     if first_iteration > args.num_iterations:
         fail(f"--total_timesteps {args.total_timesteps} is less than the {global_step} steps of {args.resume}")
     best_score = resumed.get("best_score", [-math.inf])
     if resumed and (run_dir / "best.pt").exists():  # which may be newer than the checkpoint
         best_score = max(best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
+    if WORLD_SIZE > 1:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        closing.callback(dist.destroy_process_group)
+        if RANK > 0:  # the first alone leaves something behind
+            run_dir = Path(closing.enter_context(tempfile.TemporaryDirectory()))
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
 
-    envs = make_envs(args, run_dir / "train_videos")
+    envs = make_envs(share, run_dir / "train_videos")
     closing.callback(envs.close)
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     low, high = action_bounds(envs, device)
@@ -1225,15 +1340,24 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
     groups = [{"params": p, "lr": lr, "peak_lr": lr} for p, lr in ((actor, args.learning_rate), (critic, critic_lr))]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
+
+    def load_optimizer(state: dict) -> None:
+        optimizer.load_state_dict(copy.deepcopy(state))
+        for group in optimizer.param_groups:  # the learning rate is where a CUDA graph finds it
+            group |= {"lr": torch.tensor(float(group["lr"]), device=device), "capturable": device.type == "cuda"}
+
+    load_optimizer(resumed.get("optimizer", optimizer.state_dict()))
     if resumed:
         load_weights(agent, resumed, args.resume, args)
-        optimizer.load_state_dict(resumed["optimizer"])
     elif args.checkpoint:
         load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
 
-    eval_envs = make_envs(args, run_dir / "videos", evaluation=True)
+    if args.compile:
+        agent.get_action_and_value = torch.compile(agent.get_action_and_value)
+
+    eval_envs = make_envs(share, run_dir / "videos", evaluation=True)
     closing.callback(eval_envs.close)
-    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, args)
+    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, share)
 
     # --- logging ---
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -1246,7 +1370,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     }
     (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
     wandb, wandb_id = None, resumed.get("wandb_id")
-    if args.track:
+    if share.track:
         import wandb
 
         wandb_id = wandb.init(
@@ -1267,7 +1391,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     bar_format = "{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
     total = args.num_iterations * args.batch_size
-    bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=None, bar_format=bar_format)
+    hidden = None if RANK == 0 else True  # None: where there is no terminal
+    bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=hidden, bar_format=bar_format)
     closing.callback(bar.close)
     bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
     bar.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
@@ -1304,24 +1429,62 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         return False
 
     def save(name: str, contents: dict) -> bool:
-        return not args.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
+        return not share.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
 
     # --- rollout storage ---
-    shape = (args.num_steps, args.num_envs)
+    shape = (args.num_steps, share.num_envs)
     obs = torch.zeros(*shape, *obs_space.shape, device=device)
+    next_obs = torch.zeros_like(obs[0])
     actions = torch.zeros(*shape, *action_space.shape, device=device)
-    logprobs, rewards, dones, values, next_values = torch.zeros(5, *shape, device=device)
+    logprobs, rewards, dones, values, next_values, advantages, returns = torch.zeros(7, *shape, device=device)
+    t = torch.zeros(1, dtype=torch.long, device=device)  # the step of the rollout, where a CUDA graph finds it
+    permutation = torch.zeros(share.batch_size, dtype=torch.long, device=device)
+    batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]  # the same memory
+
+    def observe(new_obs):
+        next_obs.copy_(to_device(new_obs, device))
+
+    # --- what needs no look from the host, and is launched as a whole where that is faster ---
+    cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
+
+    @cuda_graph
+    @torch.no_grad()
+    def policy_step():
+        """Into row t of the rollout; returns the actions as the simulator can take them."""
+        action, logprob, _, value = agent.get_action_and_value(next_obs)
+        obs[t], actions[t], logprobs[t], values[t] = next_obs, action, logprob, value
+        t.add_(1)
+        return action.clamp(low, high).nan_to_num()  # the simulator takes no NaN; a check finds it in the observations
+
+    @cuda_graph
+    @torch.no_grad()
+    def estimate_advantages():
+        following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
+        next_values.copy_(torch.where(dones.bool(), next_values, following))
+        gae = compute_gae(rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae)
+        advantages.copy_(gae[0])
+        returns.copy_(gae[1])
+
+    def update_epoch():
+        """Every minibatch of a permutation of the batch; returns the mean of their UPDATE_METRICS."""
+        mb_metrics = []
+        for mb_inds in permutation.split(share.minibatch_size)[: args.num_minibatches]:
+            minibatch = [x[mb_inds] for x in batch]
+            mb_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
+        return average(torch.stack(mb_metrics).mean(0))
+
+    launch_update_epoch = cuda_graph(update_epoch)
 
     # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
     rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
 
     # --- how it may end ---
-    finished, stopped_by, failures = False, 0, Counter()
+    finished, signalled, stopped_by, failures = False, 0, 0, Counter()
     last_line = last_saved = time.monotonic()
 
     def stop(signum, frame):
-        nonlocal stopped_by
-        stopped_by = signum
+        nonlocal signalled
+        signalled = signum
         for s in STOP_SIGNALS:
             signal.signal(s, signal.SIG_DFL)  # a second one ends the process at once
         os.write(2, f"\n{signal.Signals(signum).name}: stopping after this iteration; again: at once\n".encode())
@@ -1335,11 +1498,13 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             save("last.pt", snapshot)
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
+        stopped_by = max(gather(signalled))  # for all processes to stop at the same iteration
         # --- checkpoint: here a resumed run goes on, and to here an update that goes wrong is taken back ---
         snapshot = {
             "agent": copy.deepcopy(agent.state_dict()), "optimizer": copy.deepcopy(optimizer.state_dict()),
             "iteration": iteration, "global_step": global_step, "best_score": best_score,
             "metrics_size": metrics_file.tell(), "wandb_id": wandb_id, "args": given, "versions": about["versions"],
+            "world_size": WORLD_SIZE,
         }  # fmt: skip
         minutes = (time.monotonic() - last_saved) / 60
         if iteration % args.checkpoint_freq == 0 or (minutes > args.checkpoint_minutes and not args.exact_resume):
@@ -1353,7 +1518,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if finished or not stopped_by and (iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0):
             episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
             metrics = {key: value.mean().item() for key, value in episodes.items()}
-            attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": num_eval_episodes})
+            attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": len(episodes["return"])})
             name_videos(run_dir / "videos", f"step_{global_step:09d}")
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
             best = score > best_score and all(map(math.isfinite, score))
@@ -1368,40 +1533,33 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
         # --- rollout: num_steps in every environment; its noise follows from seed and iteration alone ---
         start = time.perf_counter()
-        seed_all(args.seed, iteration)
+        seed_all(args.seed, iteration, *[RANK] * (RANK > 0))
         if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
             seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
-            next_obs, _ = envs.reset(seed=(seeds // 2 + 2**31).tolist(), options=rebuild)  # evaluation's lie below 2^31
-            next_obs = to_device(next_obs, device)
-        episode_sums, num_episodes = {}, torch.zeros((), device=device)
+            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+            observe(envs.reset(seed=seeds[RANK * share.num_envs :][: share.num_envs], options=rebuild)[0])
+        t.zero_()
+        episode_sums = {"num_episodes": torch.zeros((), device=device)}
         for step in range(args.num_steps):
-            obs[step] = next_obs
-            with torch.no_grad():
-                actions[step], logprobs[step], _, values[step] = agent.get_action_and_value(next_obs)
-            action = actions[step].clamp(low, high).nan_to_num()  # the simulator takes no NaN; the check below does
-            next_obs, reward, terminated, truncated, infos = envs.step(action.to(envs.device))
-            next_obs, terminated, truncated = to_device(next_obs, device), terminated.to(device), truncated.to(device)
+            action = policy_step()
+            new_obs, *results, infos = envs.step(action.to(envs.device))
+            observe(new_obs)
+            reward, terminated, truncated = [to_device(x, device) for x in results]
             done = terminated | truncated
-            rewards[step] = reward.to(device) * args.reward_scale
+            rewards[step] = reward * args.reward_scale
             dones[step] = done
             if "final_observation" in infos:  # next_obs is the first of a new episode where done
                 with torch.no_grad():
                     final_value = agent.get_value(to_device(infos["final_observation"], device))
                 next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
-                num_episodes += done.sum()
-                final_infos = dict(infos["final_info"]["episode"])
+                final_infos = {"num_episodes": torch.ones_like(reward), **infos["final_info"]["episode"]}
                 for key, value in infos["final_info"].items():  # what the task tells beside, such as is_grasped
                     if isinstance(value, torch.Tensor) and value.shape == done.shape:
                         final_infos[f"final_{key}"] = value
                 for key, value in final_infos.items():
-                    total = torch.where(done, value.to(device).float(), 0.0).sum()
+                    total = torch.where(done, to_device(value, device).float(), 0.0).sum()
                     episode_sums[key] = episode_sums.get(key, 0.0) + total
-        with torch.no_grad():
-            following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
-        next_values = torch.where(dones.bool(), next_values, following)
-        advantages, returns = compute_gae(
-            rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
-        )
+        estimate_advantages()
 
         # --- check: what is not finite must not reach the weights; the host learns of it here, once for all steps ---
         quantities = {"observation": obs, "reward": rewards, "value": next_values}
@@ -1413,29 +1571,25 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
             # scenes that are rebuilt now and then are so all at once
             some = None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
-            next_obs = to_device(envs.reset(options=some)[0], device)
+            observe(envs.reset(options=some)[0])
+        problem = next(filter(None, gather(problem)), None)  # of any process is one of all
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
         torch.set_num_threads(num_cores())
         if args.anneal_lr:
             for group in optimizer.param_groups:
-                group["lr"] = group["peak_lr"] * (1 - iteration / args.num_iterations)
-        batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]
+                group["lr"].fill_(group["peak_lr"] * (1 - iteration / args.num_iterations))
         update_metrics = []
         for _ in range(0 if problem else args.update_epochs):
-            permutation = torch.randperm(args.batch_size, device=device)
-            for i in range(args.num_minibatches):
-                mb_inds = permutation[i * args.minibatch_size : (i + 1) * args.minibatch_size]
-                minibatch = [x[mb_inds] for x in batch]
-                update_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
-            if args.target_kl is not None:  # the host waits for this number once an epoch
-                if torch.stack(update_metrics[-args.num_minibatches :])[:, KL].mean() > args.target_kl:
-                    break
+            torch.randperm(share.batch_size, out=permutation)
+            update_metrics.append(launch_update_epoch().clone())
+            if args.target_kl is not None and update_metrics[-1][KL] > args.target_kl:  # the host waits, once an epoch
+                break
         if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
             agent.update_normalization(batch[0])
         torch.set_num_threads(1)
-        explained_variance = 1 - (returns - values).var() / returns.var().clamp(min=1e-8)
+        explained_variance = average(1 - (returns - values).var() / returns.var().clamp(min=1e-8))
         global_step += args.batch_size
 
         # --- log: here the host waits for the device ---
@@ -1446,16 +1600,20 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             if not (healthy and all(map(math.isfinite, metrics.values()))):
                 problem = "non-finite loss, gradient or normalisation"
                 agent.load_state_dict(snapshot["agent"])
-                optimizer.load_state_dict(copy.deepcopy(snapshot["optimizer"]))
-        if episode_sums:
-            means = torch.stack([*episode_sums.values()]) / num_episodes
-            metrics = dict(zip(episode_sums, means.tolist())) | metrics
+                load_optimizer(snapshot["optimizer"])
+                launch_update_epoch = cuda_graph(update_epoch)  # the one before knows the optimizer's former tensors
+        sums = Counter()
+        for part in gather(dict(zip(episode_sums, torch.stack([*episode_sums.values()]).tolist()))):
+            sums.update(part)
+        num_episodes = sums.pop("num_episodes")
+        if num_episodes:
+            metrics = {key: total / num_episodes for key, total in sums.items()} | metrics
         elapsed = time.perf_counter() - start
         metrics |= {
             "iteration": iteration + 1,
             "num_episodes": int(num_episodes),
             "explained_variance": explained_variance.item(),
-            "learning_rate": optimizer.param_groups[0]["lr"],
+            "learning_rate": optimizer.param_groups[0]["lr"].item(),
             "update_skipped": int(problem is not None),
             "sps": args.batch_size / elapsed,
             "rollout_time": rollout_time,
@@ -1490,6 +1648,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
 
 def main(argv: list[str]) -> int:
+    if RANK > 0:  # the first speaks for all, but for what goes wrong
+        sys.stdout = open(os.devnull, "w")
     args = parse_args(argv)
     check(args)
     try:
@@ -1504,7 +1664,7 @@ def main(argv: list[str]) -> int:
         traceback.print_exc()
         code = 1
     last = find_run_dir(args) / "last.pt"
-    if code and last.exists() and not args.evaluate:
+    if code and last.exists() and not args.evaluate and RANK == 0:
         print(f"{last} is safe; to go on: python {sys.argv[0]} --resume {last.parent}", file=sys.stderr)
     return code
 

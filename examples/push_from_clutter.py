@@ -28,7 +28,7 @@ from examples.push_to_goal import PushToGoalEnv
 class PushFromClutterEnv(PushToGoalEnv):
     """Robot and cameras are those of push_to_goal.py."""
 
-    num_blocks = 5  # the red one and four others
+    num_blocks = 4  # the red one and three others
     region = ((-0.12, -0.2), (0.12, 0.2))  # of the blocks' centres: lowest and highest x and y
     line = 0.2  # x of the line
 
@@ -122,16 +122,20 @@ class PushFromClutterEnv(PushToGoalEnv):
     def _get_obs_extra(self, info):
         obs = dict(tcp_pose=self.agent.tcp.pose.raw_pose)
         if self.obs_mode_struct.use_state:
-            obs.update(blocks=torch.cat([block.pose.raw_pose for block in self.blocks], dim=1), sizes=self.half_sizes)
+            blocks = torch.cat([block.pose.raw_pose for block in self.blocks], dim=1)
+            obs.update(blocks=blocks, sizes=self.half_sizes, tcp_to_push_from=self.push_from() - self.agent.tcp.pose.p)
         return obs
+
+    def push_from(self):
+        """Where to push from, (num_envs, 3): behind the red block, as the line sees it."""
+        block = self.blocks[0].pose.p.clone()
+        block[:, 0] -= self.half_sizes[:, 0] + 0.02
+        return block
 
     def compute_dense_reward(self, obs, action, info):
         """Between 0 and 3: the hand behind the red block, 1; the block near the line, 1; success, 3."""
-        block = self.blocks[0].pose.p
-        push_from = block.clone()
-        push_from[:, 0] -= self.half_sizes[:, 0] + 0.01
-        reach = 1 - torch.tanh(5 * torch.linalg.norm(push_from - self.agent.tcp.pose.p, dim=1))
-        push = 1 - torch.tanh(5 * (self.line - block[:, 0]).clamp(min=0))
-        reward = reach + push
+        reach = torch.linalg.norm(self.push_from() - self.agent.tcp.pose.p, dim=1)
+        push = (self.line - self.blocks[0].pose.p[:, 0]).clamp(min=0)
+        reward = 2 - torch.tanh(5 * reach) - torch.tanh(5 * push)
         reward[info["success"]] = 3
         return reward

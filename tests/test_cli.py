@@ -129,7 +129,7 @@ def test_defaults_by_backend(monkeypatch):
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
-    assert ppo.choose_device(args) == torch.device("cuda")
+    assert ppo.choose_device(args) == torch.device("cuda:0")
     args = ppo.parse_args(["--sim_backend", "physx_cpu", "--no-cuda"])
     assert ppo.choose_device(args) == torch.device("cpu")
 

@@ -1,0 +1,142 @@
+"""What the scripts launch as CUDA graphs gives what it gives step by step, and the host looks at no number meanwhile.
+
+On the CPU the stand-in of recorded_graph.py takes the place of CUDA graphs."""
+
+import math
+
+import batched_env
+import pytest
+import test_rgb
+import torch
+from conftest import SMALL, without_clock
+from recorded_graph import as_recorded_graph
+
+import ppo
+import ppo_rgb
+
+
+@pytest.fixture(params=[ppo, ppo_rgb], ids=["ppo", "ppo_rgb"])
+def script(request):
+    return request.param
+
+
+@pytest.fixture
+def small(script):
+    return SMALL if script is ppo else test_rgb.SMALL_IMAGES
+
+
+@pytest.fixture
+def with_graphs(train, script, device, monkeypatch):
+    def run(**flags):
+        with monkeypatch.context() as patch:
+            if device.type == "cpu":
+                patch.setattr(script, "as_cuda_graph", as_recorded_graph)
+            return train(cudagraphs=True, **flags)
+
+    return run
+
+
+def close(a, b, device):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        return all(close(a[k], b[k], device) for k in a)
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b) if device.type == "cpu" else torch.allclose(a, b, rtol=1e-3, atol=1e-5)
+    return a == b or device.type == "cuda" and math.isclose(a, b, rel_tol=1e-2, abs_tol=1e-3)
+
+
+FLAGS = [
+    dict(anneal_lr=True, norm_obs=True, target_kl=0.003, update_epochs=8),
+    dict(clip_vloss=True, finite_horizon_gae=True, bootstrap_at_done="truncated", norm_adv=False, num_minibatches=7),
+]
+
+
+@pytest.mark.parametrize("flags", FLAGS, ids=["kl-stop", "others"])
+def test_equals_step_by_step(train, with_graphs, script, device, flags):
+    if script is ppo_rgb:
+        flags = flags | dict(random_shift=2, obs_mode="rgb+depth+segmentation")
+    (rows, last, _), (graph_rows, graph_last, _) = train(cudagraphs=False, **flags), with_graphs(**flags)
+    assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
+    assert close(last["agent"], graph_last["agent"], device)
+
+
+def test_equals_step_by_step_after_a_resume_and_an_update_that_was_taken_back(
+    train, with_graphs, small, device, monkeypatch
+):
+    """The optimizer's tensors are new ones after both, of which a graph from before would know nothing."""
+    step, num_steps = batched_env.BatchedReach.step, 0
+
+    def too_large_once(self, actions):
+        nonlocal num_steps
+        obs, reward, *others = step(self, actions)
+        num_steps += self.num_envs == small.num_envs  # not in evaluations
+        return obs, torch.full_like(reward, 1e30 if num_steps == 25 else 0) + reward, *others
+
+    monkeypatch.setattr(batched_env.BatchedReach, "step", too_large_once)
+    size = small.num_envs * small.num_steps
+    results = []
+    for i, run in enumerate((train, with_graphs)):
+        num_steps, flags = 0, dict(eval_freq=0, **{} if run is with_graphs else dict(cudagraphs=False))
+        rows, *_ = run(anneal_lr=True, total_timesteps=4 * size, **flags)
+        assert [row["update_skipped"] for row in rows if row["kind"] == "train"] == [0, 0, 1, 0]
+        results.append(run(resume=f"runs/run{i + 1}", total_timesteps=8 * size, **flags))
+    (rows, last, _), (graph_rows, graph_last, _) = results
+    assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
+    assert close(last["agent"], graph_last["agent"], device)
+
+
+class Guard:
+    """While on, the host may not look at a number."""
+
+    LOOKS = ("item", "tolist", "__bool__", "__int__", "__float__", "__index__", "cpu", "numpy", "nonzero")
+
+    def __init__(self, monkeypatch, device):
+        self.on, self.cuda, self.count = False, device.type == "cuda", 0
+        for name in self.LOOKS:
+            monkeypatch.setattr(torch.Tensor, name, self.guarded(name, getattr(torch.Tensor, name)))
+
+    def guarded(self, name, method):
+        def look(*args, **kwargs):
+            assert not self.on, f"the host looks at a number: {name}"
+            self.count += 1
+            return method(*args, **kwargs)
+
+        return look
+
+    def set(self, on):
+        self.on = on
+        if self.cuda:
+            torch.cuda.set_sync_debug_mode("error" if on else "default")
+
+
+def test_the_host_looks_at_nothing_in_rollout_and_update(train, script, device, monkeypatch):
+    """From a step of the policy to the next, but for the environments' step (ManiSkillVectorEnv asks whether an episode
+    ended), and in an epoch of the update; between them it may, once an iteration or epoch."""
+    guard = Guard(monkeypatch, device)
+    step = script.ManiSkillVectorEnv.step
+    guarded_calls = []
+
+    def unguarded_step(self, actions):
+        was_on = guard.on  # not in evaluations
+        guard.set(False)
+        try:
+            return step(self, actions)
+        finally:
+            guard.set(was_on)
+
+    def guarded(function, enabled):
+        def launch():
+            guard.set(True)
+            try:
+                return function()
+            finally:
+                guard.set(function.__name__ == "policy_step")  # the rollout goes on
+                guarded_calls.append(function.__name__)
+
+        return launch
+
+    monkeypatch.setattr(script.ManiSkillVectorEnv, "step", unguarded_step)
+    monkeypatch.setattr(script, "as_cuda_graph", guarded)
+    train(norm_obs=True)
+    assert guarded_calls.count("policy_step") == 40 and guarded_calls.count("estimate_advantages") == 4
+    assert guarded_calls.count("update_epoch") >= 4 and guard.count > 0

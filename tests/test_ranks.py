@@ -1,0 +1,138 @@
+"""Several processes, started by torchrun, train together as one would with all their environments."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import ROOT, box, read_metrics, refused
+
+import ppo
+
+FLAGS = ("--num_envs", 32, "--num_eval_envs", 4, "--num_eval_episodes", 5, "--num_steps", 10, "--num_minibatches", 4,
+         "--no-cuda", "--no-capture_video", "--eval_freq", 2)  # fmt: skip
+ARGS = ppo.Args(num_minibatches=1, norm_obs=True)
+
+
+def launch(cwd, *arguments):
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2", __file__]
+    return subprocess.Popen(
+        [*torchrun, *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def one_step(rows, rank, world_size):
+    """An agent after a step on the rows that fall to this rank, and after having seen their observations."""
+    torch.set_num_threads(1)  # another number makes other last bits
+    torch.manual_seed(0)
+    agent = ppo.Agent(box(3), box(2), ARGS)
+    optimizer = torch.optim.SGD(agent.parameters(), lr=1.0)  # which shows the gradient itself
+    batch = [torch.randn(rows, n) for n in (3, 2)] + [*torch.randn(4, rows)]
+    batch[3] = 3 * batch[3] + 1  # advantages, of which the halves differ in mean and scale
+    batch[3][: rows // 2] *= 5
+    batch = [x[rank * rows // world_size : (rank + 1) * rows // world_size] for x in batch]
+    metrics = ppo.average(ppo.update_minibatch(agent, optimizer, ARGS, *batch))
+    agent.update_normalization(batch[0])
+    return {**agent.state_dict(), "metrics": metrics}
+
+
+def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
+    process = launch(tmp_path, "--total_timesteps", 960, "--exp-name", "x", *FLAGS)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+
+    # the step is that of all rows
+    expected = one_step(40, 0, 1)
+    for rank in (0, 1):
+        step = torch.load(tmp_path / f"step{rank}.pt")
+        for key in expected.keys() - {"metrics"}:
+            torch.testing.assert_close(step[key], expected[key], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(step["metrics"], expected["metrics"], rtol=1e-4, atol=1e-5)
+
+    # a run ends with the same weights in both, of episodes that differ
+    ranks = [torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1)]
+    assert all(torch.equal(ranks[0]["agent"][k], ranks[1]["agent"][k]) for k in ranks[0]["agent"])
+    assert not torch.equal(ranks[0]["actions"], ranks[1]["actions"])
+
+    # one folder, written by the first
+    assert sorted(path.name.split(".out")[0] for path in (tmp_path / "runs/x").iterdir()) == [
+        "args.json", "best.pt", "events", "last.pt", "learning_curve.png", "metrics.jsonl"
+    ]  # fmt: skip
+    rows = read_metrics(tmp_path / "runs/x")
+    assert [row["global_step"] for row in rows if row["kind"] == "train"] == [320, 640, 960]
+    assert [row["num_episodes"] for row in rows if row["kind"] == "eval"] == [6, 6, 6], "at least 5, 3 each"
+    assert output.count("writing to") == 1
+
+    # what one process cannot go on with
+    monkeypatch.chdir(tmp_path)
+    assert "torchrun --nproc_per_node=2" in refused(["--resume", "runs/x", "--total_timesteps", 2000], capsys)
+
+
+def wait_for(condition, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def last_step(folder):
+    rows = read_metrics(folder) if (folder / "metrics.jsonl").exists() else []
+    return rows[-1]["global_step"] if rows else 0
+
+
+@pytest.mark.slow
+def test_stopped_resumed_and_killed(tmp_path):
+    folder = tmp_path / "runs/x"
+    process = launch(tmp_path, "--total_timesteps", 10**7, "--exp-name", "x", *FLAGS)
+    wait_for(lambda: last_step(folder) > 1000 or process.poll() is not None)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert output.count("stopping after this iteration") == 2 and "last.pt is safe" in output, output
+    stopped_at = ppo.load_checkpoint(folder / "last.pt")["global_step"]
+    assert stopped_at == last_step(folder)
+
+    process = launch(tmp_path, "--resume", folder, "--checkpoint_freq", 1)
+    wait_for(lambda: last_step(folder) > stopped_at + 1000 or process.poll() is not None)
+    os.kill(int((tmp_path / "pid1").read_text()), signal.SIGKILL)
+    start = time.monotonic()
+    output, _ = process.communicate(timeout=60)
+    assert time.monotonic() - start < 20
+    assert process.returncode != 0 and "rank 0 lost another process of the run" in output, output
+    steps = [row["global_step"] for row in read_metrics(folder) if row["kind"] == "train"]
+    assert steps == list(range(320, steps[-1] + 1, 320)), "no row twice, none missing"
+    assert ppo.load_checkpoint(folder / "last.pt")["global_step"] >= steps[-1] - 320
+
+
+if __name__ == "__main__":  # in each of the processes
+    import batched_env
+
+    Path(f"pid{ppo.RANK}").write_text(str(os.getpid()))
+    agents, make_agent, actions = [], ppo.Agent, []
+
+    def agent_that_is_kept(*arguments):
+        agents.append(make_agent(*arguments))
+        return agents[-1]
+
+    def envs_that_tell(args, *arguments, **kwargs):
+        envs = batched_env.make_envs(args, *arguments, **kwargs)
+        step = envs.step
+        envs.step = lambda action: actions.append(action) or step(action)
+        return envs
+
+    ppo.Agent, ppo.make_envs = agent_that_is_kept, envs_that_tell
+    torch.distributed.destroy_process_group = lambda: None  # it is needed once more
+    code = ppo.main(sys.argv[1:])
+    ppo.Agent = make_agent
+    torch.save(one_step(40, ppo.RANK, 2), f"step{ppo.RANK}.pt")
+    torch.save({"agent": agents[0].state_dict(), "actions": actions[-1]}, f"rank{ppo.RANK}.pt")
+    sys.exit(code)
