@@ -298,7 +298,9 @@ class Args:
         return replace(
             self, num_envs=self.num_envs // WORLD_SIZE, num_eval_envs=math.ceil(self.num_eval_envs / WORLD_SIZE),
             num_eval_episodes=math.ceil(self.num_eval_episodes / WORLD_SIZE), sim_backend=backend,
-            **dict.fromkeys(() if RANK == 0 else ("capture_video", "save_trajectory", "save_model", "track"), False),
+            **{} if RANK == 0 else dict(
+                capture_video=False, save_train_video_freq=None, save_trajectory=False, save_model=False, track=False
+            ),
         )  # fmt: skip
 
 
@@ -323,8 +325,7 @@ MAY_CHANGE = OF_THE_MACHINE | {
 
 def fail(message: str) -> NoReturn:
     """Refuse bad input: one line, exit code 2."""
-    if LOCAL_RANK == 0:  # what is wrong is wrong in all processes
-        print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
+    print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -1070,7 +1071,9 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     loss.backward()
     if WORLD_SIZE > 1:  # all gradients in one message
         grads = [p.grad for p in agent.parameters() if p.grad is not None]
-        nn.utils.vector_to_parameters(average(nn.utils.parameters_to_vector(grads)), grads)
+        flat = average(torch.cat([grad.flatten() for grad in grads]))
+        for grad, part in zip(grads, flat.split([grad.numel() for grad in grads])):
+            grad.copy_(part.view(grad.shape))
     grad_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     optimizer.step()
 
@@ -1305,12 +1308,12 @@ def check(args: Args) -> None:
         fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
     if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
         try:
-            torch.zeros(1, device=choose_device(args.share()) if on_gpu else "cuda")
+            torch.zeros(1, device=choose_device(args.share()) if on_gpu else f"cuda:{LOCAL_RANK}")
             if on_gpu:
                 sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]
-            if on_gpu:
+            if on_gpu or WORLD_SIZE > 1:
                 remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in reason else "see examples/check_machine.py"
                 fail(f"--sim_backend {args.sim_backend}: {reason}: {remedy}, or use --sim_backend physx_cpu")
             args.cuda = False
@@ -1319,6 +1322,12 @@ def check(args: Args) -> None:
         parse_backends(args.sim_backend, args.render_backend)
     except (KeyError, ValueError, RuntimeError) as error:
         fail(f"--render_backend {args.render_backend}: {error}; --help lists what there is")
+    if args.compile:
+        try:
+            torch.compile(lambda x: x + 1)(torch.zeros(2, device=choose_device(args.share())))
+        except Exception as error:
+            args.compile = False
+            print(f"not compiled: {str(error).splitlines()[0]}")
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track needs Weights & Biases: pip install wandb")
 
@@ -1459,7 +1468,10 @@ def check_observations(args: Args, spec, robots: list) -> None:
         return
     args = args.share()
     device, needed = choose_device(args), image_bytes(args, cameras)
-    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+    if device.type == "cuda":
+        free = torch.cuda.mem_get_info(device)[0]
+    else:
+        free = psutil.virtual_memory().available / LOCAL_WORLD_SIZE
     print(f"images of a rollout ({sizes}, {args.num_steps} steps of {args.num_envs} environments): "
           f"{needed / 2**20:,.1f} MiB of {free / 2**20:,.0f} free")  # fmt: skip
     if needed > 0.9 * free:
@@ -1469,9 +1481,10 @@ def check_observations(args: Args, spec, robots: list) -> None:
 
 def choose_device(args: Args) -> torch.device:
     """Where the agent learns: with the simulation on its GPU, else on any GPU there is, else on the CPU."""
-    if args.sim_backend.startswith("physx_cuda"):
-        return torch.device(args.sim_backend.replace("physx_", ""))
-    return torch.device(f"cuda:{LOCAL_RANK}" if args.cuda and torch.cuda.is_available() else "cpu")
+    backend, _, index = args.sim_backend.partition(":")
+    if backend == "physx_cuda" or args.cuda and torch.cuda.is_available():
+        return torch.device(f"cuda:{index or LOCAL_RANK}")
+    return torch.device("cpu")
 
 
 def summary(metrics: dict) -> list[str]:
@@ -1531,9 +1544,17 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir = find_run_dir(args)
     given = asdict(args)
-    prepare_rendering(args)
+    device = choose_device(args.share())
+    if device.type == "cuda":
+        torch.cuda.set_device(device)  # where CUDA graphs are captured
+    if WORLD_SIZE > 1:
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        closing.callback(dist.destroy_process_group)
+        args = gather(args)[0]  # the machines may differ in what is left to them
+        if RANK > 0:  # the first alone leaves something behind
+            run_dir = Path(closing.enter_context(tempfile.TemporaryDirectory()))
     share = args.share()
-    device = choose_device(share)
+    prepare_rendering(share)
     resumed = load_checkpoint(args.resume) if args.resume else {}
     size = resumed.get("world_size", WORLD_SIZE)
     if size != WORLD_SIZE:
@@ -1544,13 +1565,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     best_score = resumed.get("best_score", [-math.inf])
     if resumed and (run_dir / "best.pt").exists():  # which may be newer than the checkpoint
         best_score = max(best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
-    if WORLD_SIZE > 1:
-        if device.type == "cuda":
-            torch.cuda.set_device(device)
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-        closing.callback(dist.destroy_process_group)
-        if RANK > 0:  # the first alone leaves something behind
-            run_dir = Path(closing.enter_context(tempfile.TemporaryDirectory()))
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
@@ -1578,8 +1592,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     elif args.checkpoint:
         load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
 
+    if WORLD_SIZE > 1:  # the same weights, whatever each machine made of the seed
+        agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
     if args.compile:
-        agent.get_action_and_value = torch.compile(agent.get_action_and_value)
+        agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
 
     eval_envs = make_envs(share, run_dir / "videos", evaluation=True)
     closing.callback(eval_envs.close)
@@ -1711,6 +1727,11 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     launch_update_epoch = cuda_graph(update_epoch)
 
+    @closing.callback
+    def drop_graph():  # the process group waits for those that hold its operations
+        nonlocal launch_update_epoch
+        launch_update_epoch = None
+
     # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
     rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
 
@@ -1777,7 +1798,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         t.zero_()
         episode_sums = {"num_episodes": torch.zeros((), device=device)}
         for step in range(args.num_steps):
-            action = policy_step()
+            action = policy_step().clone()  # a task may keep it
             new_obs, *results, infos = envs.step(action.to(envs.device))
             observe(new_obs)
             reward, terminated, truncated = [to_device(x, device) for x in results]

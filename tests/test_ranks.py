@@ -7,15 +7,17 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from conftest import ROOT, box, read_metrics, refused
 
 import ppo
+import ppo_rgb
 
 FLAGS = ("--num_envs", 32, "--num_eval_envs", 4, "--num_eval_episodes", 5, "--num_steps", 10, "--num_minibatches", 4,
          "--no-cuda", "--no-capture_video", "--eval_freq", 2)  # fmt: skip
-ARGS = ppo.Args(num_minibatches=1, norm_obs=True)
 
 
 def launch(cwd, *arguments):
@@ -31,18 +33,25 @@ def launch(cwd, *arguments):
     )
 
 
-def one_step(rows, rank, world_size):
+def one_step(script, rows, rank, world_size):
     """An agent after a step on the rows that fall to this rank, and after having seen their observations."""
     torch.set_num_threads(1)  # another number makes other last bits
     torch.manual_seed(0)
-    agent = ppo.Agent(box(3), box(2), ARGS)
+    args = script.Args(num_minibatches=1, norm_obs=True)
+    obs, space = torch.randn(rows, 3), box(3)
+    if script is ppo_rgb:
+        obs = {"state": obs, "rgb": torch.randint(256, (rows, 36, 36, 3), dtype=torch.uint8)}
+        space = gym.spaces.Dict(state=space, rgb=gym.spaces.Box(0, 255, (36, 36, 3), np.uint8))
+    agent = script.Agent(space, box(2), args)
     optimizer = torch.optim.SGD(agent.parameters(), lr=1.0)  # which shows the gradient itself
-    batch = [torch.randn(rows, n) for n in (3, 2)] + [*torch.randn(4, rows)]
-    batch[3] = 3 * batch[3] + 1  # advantages, of which the halves differ in mean and scale
-    batch[3][: rows // 2] *= 5
-    batch = [x[rank * rows // world_size : (rank + 1) * rows // world_size] for x in batch]
-    metrics = ppo.average(ppo.update_minibatch(agent, optimizer, ARGS, *batch))
-    agent.update_normalization(batch[0])
+    actions, (logprobs, advantages, returns, values) = torch.randn(rows, 2), torch.randn(4, rows)
+    advantages[: rows // 2] = 5 * advantages[: rows // 2] + 2  # the halves differ in mean and scale
+    share = slice(rank * rows // world_size, (rank + 1) * rows // world_size)
+    batch = [x[share] for x in (actions, logprobs, advantages, returns, values)]
+    obs = {k: v[share] for k, v in script.as_dict(obs).items()}
+    inputs = obs if script is ppo_rgb else obs["state"]
+    metrics = script.average(script.update_minibatch(agent, optimizer, args, inputs, *batch))
+    agent.update_normalization(obs["state"])
     return {**agent.state_dict(), "metrics": metrics}
 
 
@@ -52,12 +61,12 @@ def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
     assert process.returncode == 0, output
 
     # the step is that of all rows
-    expected = one_step(40, 0, 1)
-    for rank in (0, 1):
-        step = torch.load(tmp_path / f"step{rank}.pt")
-        for key in expected.keys() - {"metrics"}:
-            torch.testing.assert_close(step[key], expected[key], rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(step["metrics"], expected["metrics"], rtol=1e-4, atol=1e-5)
+    for script in (ppo, ppo_rgb):
+        expected = one_step(script, 40, 0, 1)
+        for rank in (0, 1):
+            step = torch.load(tmp_path / f"{script.__name__}{rank}.pt")
+            for key, value in expected.items():
+                torch.testing.assert_close(step[key], value, rtol=1e-4, atol=1e-5)
 
     # a run ends with the same weights in both, of episodes that differ
     ranks = [torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1)]
@@ -133,6 +142,7 @@ if __name__ == "__main__":  # in each of the processes
     torch.distributed.destroy_process_group = lambda: None  # it is needed once more
     code = ppo.main(sys.argv[1:])
     ppo.Agent = make_agent
-    torch.save(one_step(40, ppo.RANK, 2), f"step{ppo.RANK}.pt")
+    for script in (ppo, ppo_rgb):
+        torch.save(one_step(script, 40, ppo.RANK, 2), f"{script.__name__}{ppo.RANK}.pt")
     torch.save({"agent": agents[0].state_dict(), "actions": actions[-1]}, f"rank{ppo.RANK}.pt")
     sys.exit(code)
