@@ -117,12 +117,7 @@ def stable_baselines3(iterations):
     return [BATCH / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=8, help="iterations of 1600 steps in each repetition")
-    options = parser.parse_args()
-
+def compare(options):
     rates = {"simulation alone": [], "ppo.py": [], "ppo.py, rollout phase": [], "SB3": []}
     for _ in range(options.repetitions):
         rates["simulation alone"].append(statistics.median(simulation_alone(options.iterations)))
@@ -139,6 +134,19 @@ def main():
     for a, b in (("ppo.py", "SB3"), ("ppo.py, rollout phase", "simulation alone"), ("ppo.py", "simulation alone")):
         ratios = [x / y for x, y in zip(rates[a], rates[b])]
         print(f"  {a + ' / ' + b:<44}{statistics.median(ratios):6.2f}   ({min(ratios):.2f} to {max(ratios):.2f})")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=8, help="iterations of 1600 steps in each repetition")
+    parser.add_argument("--cores", type=int, nargs="+", default=sorted({1, ppo.num_cores()}), help="how many to use")
+    options = parser.parse_args()
+
+    all_cores = sorted(os.sched_getaffinity(0))
+    for cores in options.cores:
+        os.sched_setaffinity(0, all_cores[:cores])  # which the workers inherit
+        compare(options)
 
 
 if __name__ == "__main__":
