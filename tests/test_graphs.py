@@ -54,7 +54,7 @@ FLAGS = [
 @pytest.mark.parametrize("flags", FLAGS, ids=["kl-stop", "others"])
 def test_equals_step_by_step(train, with_graphs, script, device, flags):
     if script is ppo_rgb:
-        flags = flags | dict(random_shift=2, obs_mode="rgb+depth+segmentation")
+        flags = flags | dict(random_shift=2, obs_mode="rgb+depth+segmentation", update_epochs=2)
     (rows, last, _), (graph_rows, graph_last, _) = train(cudagraphs=False, **flags), with_graphs(**flags)
     assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
     assert close(last["agent"], graph_last["agent"], device)
@@ -83,6 +83,14 @@ def test_equals_step_by_step_after_a_resume_and_an_update_that_was_taken_back(
     (rows, last, _), (graph_rows, graph_last, _) = results
     assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
     assert close(last["agent"], graph_last["agent"], device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [ppo])
+def test_compiled_is_near(train, device):
+    (rows, *_), (compiled_rows, *_) = train(total_timesteps=640), train(total_timesteps=640, compile=True)
+    for row, compiled in zip(without_clock(rows), without_clock(compiled_rows), strict=True):
+        assert row.pop("kind") == compiled.pop("kind") and row == pytest.approx(compiled, rel=0.02, abs=0.01)
 
 
 class Guard:

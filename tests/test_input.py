@@ -134,7 +134,7 @@ VALID = {
 }  # fmt: skip
 SWITCHES = [
     "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "shared_features", "norm_obs", "save_model",
-    "exact_resume", "partial_reset", "eval_partial_reset", "torch_deterministic", "compile", "cudagraphs",
+    "exact_resume", "partial_reset", "eval_partial_reset", "torch_deterministic", "cudagraphs",
 ]  # fmt: skip
 NUMBERS = ["0", "-1", "1.5.", "nan", "inf", "x", ""]
 INVALID = {
@@ -155,7 +155,7 @@ INVALID = {
 
 @pytest.mark.slow
 def test_fuzz(in_tmp, capsys, monkeypatch):
-    """300 generated command lines: the valid ones run (tiny), those with one invalid value anywhere are refused."""
+    """200 generated command lines: the valid ones run (tiny), those with one invalid value anywhere are refused."""
     rng = random.Random(0)
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
     monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)  # slow
@@ -165,7 +165,7 @@ def test_fuzz(in_tmp, capsys, monkeypatch):
         return [f"{flag}={value}"] if rng.random() < 0.5 else [flag, str(value)]
 
     counts = [0, 0]
-    for k in range(300):
+    for k in range(200):
         base = dict(num_envs=7, num_eval_envs=2, num_eval_episodes=2, num_steps=9, total_timesteps=126,
                     num_minibatches=4, update_epochs=1, exp_name=f"run{k}")  # fmt: skip
         chosen = base | {flag: rng.choice(VALID[flag]) for flag in rng.sample([*VALID], rng.randrange(12))}
@@ -188,4 +188,4 @@ def test_fuzz(in_tmp, capsys, monkeypatch):
             assert (Path("runs") / chosen["exp_name"] / "metrics.jsonl").exists()
         counts[invalid] += 1
         capsys.readouterr()
-    assert min(counts) > 100
+    assert min(counts) > 70
