@@ -1104,7 +1104,7 @@ def as_cuda_graph(function, enabled: bool):
             torch.cuda.current_stream().wait_stream(stream)
             return result
         if num_calls == 4:
-            with torch.cuda.graph(graph):
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads, as of NCCL, go on
                 result = function()
         graph.replay()
         return result
