@@ -825,7 +825,7 @@ class Agent(nn.Module):
         mean = self.actor_mean(features)
         policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
         if action is None:  # not policy.sample(), for which the host waits: torch.normal looks at the deviations
-            action = mean + policy.stddev * torch.randn_like(mean)
+            action = (mean + policy.stddev * torch.randn_like(mean)).detach()
         if self.critic_features is not self.actor_features:
             features = self.critic_features(obs)
         value = self.critic(features).squeeze(-1)

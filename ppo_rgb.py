@@ -978,7 +978,7 @@ class Agent(nn.Module):
         mean = self.actor_mean(features)
         policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
         if action is None:  # not policy.sample(), for which the host waits: torch.normal looks at the deviations
-            action = mean + policy.stddev * torch.randn_like(mean)
+            action = (mean + policy.stddev * torch.randn_like(mean)).detach()
         value = self.critic(features).squeeze(-1)
         return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
 
