@@ -2,6 +2,10 @@
 
     python ppo.py --env_id examples.curriculum:PushFurther-v1
 
+On 2 CPU cores 250,000 steps, the default, took 11 to 13 minutes (other work ran beside). Of 64 evaluation episodes,
+which have full difficulty, 63, 64 and 63 succeeded (seeds 1 to 3); the mean level of training rose from 0 to 0.88, 0.96
+and 0.94.
+
 What it teaches, beside examples/push_to_goal.py: how an episode is told what to be, through reset's `options`, and
 where they come from when training resets by itself. ManiSkillVectorEnv resets the environments whose episodes ended
 with `options={"env_idx": ...}` and nothing else, so the difficulty is added in `reset`, below:

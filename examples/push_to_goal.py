@@ -2,6 +2,10 @@
 
     python ppo.py --env_id examples.push_to_goal:PushToGoal-v1
 
+On 2 CPU cores 250,000 steps, the default, took 11 to 17 minutes (other work ran beside). Of 64 evaluation episodes 58,
+62 and 62 succeeded at some step (seeds 1 to 3). The cube is not held at the goal, where an episode of training ends:
+--no-partial_reset would teach that.
+
 A task says five things: what is in the scene (`_load_scene`, once), how an episode starts (`_initialize_episode`, at
 each reset, for the environments that reset), what success and failure are (`evaluate`), what the policy sees
 (`_get_obs_extra`, beside the robot's joints), and what it is paid for (`compute_dense_reward`). Everything is batched:
