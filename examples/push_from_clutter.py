@@ -2,6 +2,9 @@
 
     python ppo.py --env_id examples.push_from_clutter:PushFromClutter-v1
 
+On 2 CPU cores 250,000 steps, the default, took 13 and 14 minutes (other work ran beside); 58 and 61 of 64 evaluation
+episodes succeeded (seeds 1 and 2).
+
 What it teaches, beside examples/push_to_goal.py:
 
 * Placing without overlap, with ManiSkill's UniformPlacementSampler: see `_free_places`.
