@@ -74,15 +74,20 @@ def make_envs(args, record_dir, evaluation=False):
     return ppo.ManiSkillVectorEnv(env, auto_reset=not evaluation, record_metrics=True)
 
 
-def run(flags, warm_up):
-    """(rollout seconds, update seconds) of the iterations after `warm_up` ones."""
+def train(flags, warm_up):
+    """What a run in this process logged of each iteration after `warm_up` ones: a list of dicts."""
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = ppo.parse_args([*flags.split(), "--exp_name", f"{folder}/x", "--eval_freq", "0", "--num_eval_envs", "1",
                                "--num_eval_episodes", "1", "--target_kl", "None", "--no-capture_video"])  # fmt: skip
         with contextlib.ExitStack() as closing:
             ppo.train(args, closing)
         rows = [json.loads(line) for line in Path(f"{folder}/x/metrics.jsonl").read_text().splitlines()]
-    rows = [row for row in rows if row["kind"] == "train"][warm_up:]
+    return [row for row in rows if row["kind"] == "train"][warm_up:]
+
+
+def run(flags, warm_up):
+    """(rollout seconds, update seconds) of an iteration, medians."""
+    rows = train(flags, warm_up)
     return [statistics.median(row[k] for row in rows) for k in ("rollout_time", "update_time")]
 
 

@@ -12,7 +12,6 @@ policy and one for value), minibatch size, epochs and batch, and no target KL th
 """
 
 import argparse
-import contextlib
 import os
 import platform
 import statistics
@@ -24,42 +23,19 @@ import gymnasium as gym
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from learner import train
+
 import ppo
 
 BATCH, MINIBATCHES, EPOCHS = 1600, 8, 8
 
 
-class Ours:
-    """ppo.py's rollout and update, as in its main loop."""
-
-    def __init__(self):
-        flags = f"--no-cuda --num_envs 16 --num_steps 100 --num_minibatches {MINIBATCHES} --update_epochs {EPOCHS}"
-        self.flags = [*flags.split(), "--target_kl", "None", "--no-capture_video"]
-
-    def run(self, iterations):
-        """Returns the medians over iterations of: steps a second, and steps a second of the rollout phase."""
-        import json
-        import tempfile
-
-        with tempfile.TemporaryDirectory() as folder:
-            here = os.getcwd()
-            os.chdir(folder)
-            try:
-                args = ppo.parse_args(
-                    [*self.flags, "--total_timesteps", str(BATCH * iterations), "--exp_name", "x", "--eval_freq", "0",
-                     "--num_eval_envs", "1", "--num_eval_episodes", "1"]
-                )  # fmt: skip
-                stdout, sys.stdout = sys.stdout, open(os.devnull, "w")
-                try:
-                    with contextlib.ExitStack() as closing:
-                        ppo.train(args, closing)
-                finally:
-                    sys.stdout = stdout
-                lines = Path("runs/x/metrics.jsonl").read_text().splitlines()
-            finally:
-                os.chdir(here)
-        rows = [row for row in map(json.loads, lines) if row["kind"] == "train"][1:]
-        return [row["sps"] for row in rows], [BATCH / row["rollout_time"] for row in rows]
+def ours(iterations):
+    """ppo.py as it is. Returns for each iteration: steps a second, and steps a second of the rollout phase."""
+    flags = (f"--no-cuda --num_envs 16 --num_steps {BATCH // 16} --num_minibatches {MINIBATCHES} "
+             f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations}")  # fmt: skip
+    rows = train(flags, warm_up=1)
+    return [row["sps"] for row in rows], [BATCH / row["rollout_time"] for row in rows]
 
 
 def simulation_alone(iterations):
@@ -121,7 +97,7 @@ def compare(options):
     rates = {"simulation alone": [], "ppo.py": [], "ppo.py, rollout phase": [], "SB3": []}
     for _ in range(options.repetitions):
         rates["simulation alone"].append(statistics.median(simulation_alone(options.iterations)))
-        whole, rollout = Ours().run(options.iterations)
+        whole, rollout = ours(options.iterations)
         rates["ppo.py"].append(statistics.median(whole))
         rates["ppo.py, rollout phase"].append(statistics.median(rollout))
         rates["SB3"].append(statistics.median(stable_baselines3(options.iterations)))
