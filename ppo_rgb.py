@@ -98,6 +98,7 @@ from mani_skill.sensors.camera import parse_camera_configs, update_camera_config
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs import Articulation, Pose
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -114,6 +115,27 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
+
+# Most of a step of one CPU-simulated environment is ManiSkill's Python, and much of that these two functions, for the
+# copies they make of each number: here are the same numbers with fewer.
+create_pose, set_joint_drive_targets = Pose.create, Articulation.set_joint_drive_targets
+
+
+def create_pose_at_once(pose, device=None) -> Pose:
+    if not (isinstance(pose, list) and isinstance(pose[0], sapien.Pose)):
+        return create_pose(pose, device)
+    return Pose(torch.from_numpy(np.array([np.concatenate((p.p, p.q)) for p in pose])).to(device))
+
+
+def set_joint_drive_targets_at_once(self, targets, joints=None, joint_indices=None) -> None:
+    if self.scene.gpu_sim_enabled or not isinstance(targets, torch.Tensor):
+        return set_joint_drive_targets(self, targets, joints, joint_indices)
+    for joint, target in zip(joints, targets[0].numpy()[:, None]):
+        joint._objs[0].drive_target = target
+
+
+Pose.create = staticmethod(create_pose_at_once)
+Articulation.set_joint_drive_targets = set_joint_drive_targets_at_once
 
 # what concerns no user: the render device is replaced above, robots are as they are
 NOISE = "Requested to use render device|mani_skill is not installed with git|"
@@ -1089,23 +1111,40 @@ def as_cuda_graph(function, enabled: bool):
 
     It takes no arguments, never makes the host wait, and finds the tensors that it reads and writes always in the same
     place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
-    as capturing wants it; the next one captures it, and those after that replay."""
+    as capturing wants it, and the third looks whether the host waits, in which case it is never captured; the next one
+    captures it, and those after that replay.
+
+    Raises:
+        RunError: where the capture fails, after which CUDA's random numbers cannot be used any more."""
     if not enabled:
         return function
-    graph, stream, num_calls, result = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None
+    graph, stream, num_calls, result, waits = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None, []
 
     def launch():
         nonlocal num_calls, result
         num_calls += 1
         if num_calls <= 3:
             stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
+            with torch.cuda.stream(stream), warnings.catch_warnings(record=num_calls == 3) as caught:
+                if num_calls == 3:
+                    warnings.simplefilter("always")
+                    torch.cuda.set_sync_debug_mode("warn")
                 result = function()
+                torch.cuda.set_sync_debug_mode("default")
             torch.cuda.current_stream().wait_stream(stream)
+            waits.extend(f"{w.filename}:{w.lineno}" for w in caught or () if "synchronizing" in str(w.message))
+            if waits:
+                tqdm.write(f"{function.__name__}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
             return result
+        if waits:
+            return function()
         if num_calls == 4:
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads, as of NCCL, go on
-                result = function()
+            try:
+                with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads, as of NCCL, go on
+                    result = function()
+            except RuntimeError as error:
+                reason = error.__context__ or error  # what stopped it, or that it was stopped
+                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {reason}") from None
         graph.replay()
         return result
 

@@ -2,13 +2,19 @@
 
 On the CPU the stand-in of recorded_graph.py takes the place of CUDA graphs."""
 
+import contextlib
 import math
+import re
+import subprocess
+import sys
+import warnings
+from types import SimpleNamespace
 
 import batched_env
 import pytest
 import test_rgb
 import torch
-from conftest import SMALL, without_clock
+from conftest import ROOT, SMALL, without_clock
 from recorded_graph import as_recorded_graph
 
 import ppo
@@ -101,6 +107,95 @@ def test_compiled_is_near(train, script, monkeypatch):
     monkeypatch.setattr(script, "update_minibatch", compare)
     rows, *_ = train(total_timesteps=640, compile=True, cudagraphs=False)
     assert len(compared) == 4 * 2 * 4 * 4 and all(row.get("approx_kl", 0) < 0.1 for row in rows)
+
+
+class FakeCuda:
+    """What `as_cuda_graph` needs of torch.cuda, on the CPU: a function may ask `wait` whether it may wait."""
+
+    CUDAGraph = Stream = lambda *_: SimpleNamespace(replay=lambda: None, wait_stream=lambda other: None)
+    current_stream, stream = Stream, contextlib.nullcontext
+    capturing, mode = False, "default"
+
+    def set_sync_debug_mode(self, mode):
+        self.mode = mode
+
+    @contextlib.contextmanager
+    def graph(self, graph, capture_error_mode):
+        self.capturing = True
+        yield
+        self.capturing = False
+
+    def wait(self):
+        if self.capturing:
+            raise RuntimeError("operation not permitted when stream is capturing")
+        if self.mode == "warn":
+            warnings.warn("called a synchronizing CUDA operation", stacklevel=2)
+
+
+@pytest.fixture
+def cuda(device, script, monkeypatch):
+    if device.type == "cuda":
+        x = torch.ones(1, device=device)
+        return SimpleNamespace(wait=x.item)
+    fake = FakeCuda()
+    monkeypatch.setattr(script, "torch", SimpleNamespace(cuda=fake))
+    return fake
+
+
+def test_what_makes_the_host_wait_is_launched_step_by_step(cuda, script, capsys):
+    calls = []
+
+    def looks():
+        cuda.wait()
+        calls.append(0)
+        return len(calls)
+
+    launch = script.as_cuda_graph(looks, True)
+    assert [launch() for _ in range(6)] == [1, 2, 3, 4, 5, 6]
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("looks: no CUDA graph, since") and "makes the host wait" in line
+
+
+def test_other_functions_are_captured(cuda, script, capsys):
+    calls = []
+    launch = script.as_cuda_graph(lambda: calls.append(0), True)
+    for _ in range(6):
+        launch()
+    assert len(calls) == 4 and not capsys.readouterr().out
+
+
+CANNOT_BE_CAPTURED = """
+import torch, {script} as script
+calls = []
+def looks():
+    calls.append(torch.randn(1, device="cuda"))
+    if len(calls) > 3:
+        calls[-1].item()
+launch = script.as_cuda_graph(looks, True)
+for _ in range(6):
+    launch()
+"""
+
+
+def test_what_cannot_be_captured_ends_the_run_in_one_line(cuda, device, script):
+    """A wait that the look at the third call does not see, since it comes later."""
+    message = "looks: no CUDA graph (try --no-cudagraphs): "
+    if device.type == "cuda":  # in a process of its own, whose CUDA is spoilt by it
+        code = CANNOT_BE_CAPTURED.format(script=script.__name__)
+        process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+        assert process.returncode == 1 and f"RunError: {message}" in process.stderr
+        return
+    calls = []
+
+    def looks():
+        calls.append(0)
+        if len(calls) > 3:
+            cuda.wait()
+
+    launch = script.as_cuda_graph(looks, True)
+    with pytest.raises(script.RunError, match=re.escape(message) + "operation not permitted"):
+        for _ in range(6):
+            launch()
 
 
 class Guard:
