@@ -54,7 +54,9 @@ from typing import Literal, NoReturn, Optional
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
-    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True"
+    "ignore",
+    message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True|"
+    "Synchronization debug mode is a prototype",
 )
 
 import gymnasium as gym
@@ -840,14 +842,22 @@ class Agent(nn.Module):
         """The deterministic action: the mean of the policy."""
         return self.actor_mean(self.actor_features(self.normalize(obs)))
 
-    def get_action_and_value(self, obs, action=None):
-        """Returns action (sampled unless given), its log-probability, the policy's entropy, and the value."""
+    def get_policy(self, features):
+        mean = self.actor_mean(features)
+        return Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
+
+    def sample_action(self, obs):
+        """Returns an action drawn from the policy, and its log-probability."""
+        policy = self.get_policy(self.actor_features(self.normalize(obs)))
+        # not policy.sample(), for which the host waits: torch.normal looks at the deviations
+        action = (policy.mean + policy.stddev * torch.randn_like(policy.mean)).detach()
+        return action, policy.log_prob(action).sum(-1)
+
+    def get_action_and_value(self, obs, action):
+        """Returns the action, its log-probability, the policy's entropy, and the value."""
         obs = self.normalize(obs)
         features = self.actor_features(obs)
-        mean = self.actor_mean(features)
-        policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
-        if action is None:  # not policy.sample(), for which the host waits: torch.normal looks at the deviations
-            action = (mean + policy.stddev * torch.randn_like(mean)).detach()
+        policy = self.get_policy(features)
         if self.critic_features is not self.actor_features:
             features = self.critic_features(obs)
         value = self.critic(features).squeeze(-1)
@@ -942,6 +952,18 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
 
+def call_and_look_for_waits(function) -> tuple:
+    """What a function returns, and where in the code it made the host wait for the GPU, as far as torch notices."""
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = function()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return result, [f"{w.filename}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message)]
+
+
 def as_cuda_graph(function, enabled: bool):
     """`function`, launched as one CUDA graph: a network so small computes faster than its kernels can be launched one
     by one.
@@ -958,30 +980,27 @@ def as_cuda_graph(function, enabled: bool):
     graph, stream, num_calls, result, waits = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None, []
 
     def launch():
-        nonlocal num_calls, result
+        nonlocal num_calls, result, waits
         num_calls += 1
         if num_calls <= 3:
             stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream), warnings.catch_warnings(record=num_calls == 3) as caught:
-                if num_calls == 3:
-                    warnings.simplefilter("always")
-                    torch.cuda.set_sync_debug_mode("warn")
-                result = function()
-                torch.cuda.set_sync_debug_mode("default")
+            with torch.cuda.stream(stream):
+                result, waits = call_and_look_for_waits(function) if num_calls == 3 else (function(), [])
             torch.cuda.current_stream().wait_stream(stream)
-            waits.extend(f"{w.filename}:{w.lineno}" for w in caught or () if "synchronizing" in str(w.message))
             if waits:
                 tqdm.write(f"{function.__name__}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
             return result
         if waits:
             return function()
         if num_calls == 4:
-            try:
-                with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads, as of NCCL, go on
+            gc.collect()  # what is collected during the capture might free memory of the GPU, which ends the capture
+            try:  # other threads, as those of NCCL, go on meanwhile
+                with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                     result = function()
             except RuntimeError as error:
-                reason = error.__context__ or error  # what stopped it, or that it was stopped
-                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {reason}") from None
+                while error.__context__:  # what stopped it, rather than that it was stopped
+                    error = error.__context__
+                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {error}") from None
         graph.replay()
         return result
 
@@ -1405,6 +1424,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     if WORLD_SIZE > 1:  # the same weights, whatever each machine made of the seed
         agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
     if args.compile:
+        agent.sample_action = torch.compile(agent.sample_action, dynamic=False)
         agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
 
     eval_envs = make_envs(share, run_dir / "videos", evaluation=True)
@@ -1503,14 +1523,16 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     @torch.no_grad()
     def policy_step():
         """Into row t of the rollout; returns the actions as the simulator can take them."""
-        action, logprob, _, value = agent.get_action_and_value(next_obs)
-        obs[t], actions[t], logprobs[t], values[t] = next_obs, action, logprob, value
+        action, logprob = agent.sample_action(next_obs)
+        obs[t], actions[t], logprobs[t] = next_obs, action, logprob
         t.add_(1)
         return action.clamp(low, high).nan_to_num()  # the simulator takes no NaN; a check finds it in the observations
 
     @cuda_graph
     @torch.no_grad()
     def estimate_advantages():
+        for mb_obs, mb_values in zip(*[x.split(share.minibatch_size) for x in (batch[0], batch[-1])]):
+            mb_values.copy_(agent.get_value(mb_obs))  # for which no step had to wait
         following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
         next_values.copy_(torch.where(dones.bool(), next_values, following))
         gae = compute_gae(rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae)

@@ -55,7 +55,9 @@ from unittest.mock import MagicMock, patch
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
-    "ignore", message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True"
+    "ignore",
+    message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True|"
+    "Synchronization debug mode is a prototype",
 )
 
 import gymnasium as gym
@@ -1105,6 +1107,18 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
 
+def call_and_look_for_waits(function) -> tuple:
+    """What a function returns, and where in the code it made the host wait for the GPU, as far as torch notices."""
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = function()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return result, [f"{w.filename}:{w.lineno}" for w in caught if "called a synchronizing" in str(w.message)]
+
+
 def as_cuda_graph(function, enabled: bool):
     """`function`, launched as one CUDA graph: a network so small computes faster than its kernels can be launched one
     by one.
@@ -1121,30 +1135,27 @@ def as_cuda_graph(function, enabled: bool):
     graph, stream, num_calls, result, waits = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None, []
 
     def launch():
-        nonlocal num_calls, result
+        nonlocal num_calls, result, waits
         num_calls += 1
         if num_calls <= 3:
             stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream), warnings.catch_warnings(record=num_calls == 3) as caught:
-                if num_calls == 3:
-                    warnings.simplefilter("always")
-                    torch.cuda.set_sync_debug_mode("warn")
-                result = function()
-                torch.cuda.set_sync_debug_mode("default")
+            with torch.cuda.stream(stream):
+                result, waits = call_and_look_for_waits(function) if num_calls == 3 else (function(), [])
             torch.cuda.current_stream().wait_stream(stream)
-            waits.extend(f"{w.filename}:{w.lineno}" for w in caught or () if "synchronizing" in str(w.message))
             if waits:
                 tqdm.write(f"{function.__name__}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
             return result
         if waits:
             return function()
         if num_calls == 4:
-            try:
-                with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads, as of NCCL, go on
+            gc.collect()  # what is collected during the capture might free memory of the GPU, which ends the capture
+            try:  # other threads, as those of NCCL, go on meanwhile
+                with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                     result = function()
             except RuntimeError as error:
-                reason = error.__context__ or error  # what stopped it, or that it was stopped
-                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {reason}") from None
+                while error.__context__:  # what stopped it, rather than that it was stopped
+                    error = error.__context__
+                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {error}") from None
         graph.replay()
         return result
 

@@ -120,7 +120,7 @@ class FakeCuda:
         self.mode = mode
 
     @contextlib.contextmanager
-    def graph(self, graph, capture_error_mode):
+    def graph(self, graph, stream, capture_error_mode):
         self.capturing = True
         yield
         self.capturing = False

@@ -121,6 +121,6 @@ def test_initial_policy_is_nearly_zero_and_deterministic_action_is_its_mean():
     obs = torch.randn(64, OBS)
     assert agent.get_action(obs).abs().max() < 0.1
     torch.manual_seed(0)
-    samples = torch.stack([agent.get_action_and_value(obs)[0] for _ in range(2000)])
+    samples = torch.stack([agent.sample_action(obs)[0] for _ in range(2000)])
     torch.testing.assert_close(samples.mean(0), agent.get_action(obs), atol=0.08, rtol=0)
     assert agent.get_value(obs).shape == (64,)
