@@ -1437,7 +1437,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     about = {
         "args": asdict(args),
         "versions": {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in packages},
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {num_cores()} cores",
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{num_cores()} CPU core(s)",
         "command": shlex.join(sys.argv),
     }
     (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
@@ -1466,7 +1466,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     hidden = None if RANK == 0 else True  # None: where there is no terminal
     bar = tqdm(total=total, initial=global_step, dynamic_ncols=True, disable=hidden, bar_format=bar_format)
     closing.callback(bar.close)
-    bar.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {about['device']}")
+    processes = f" in {WORLD_SIZE} processes" * (WORLD_SIZE > 1)
+    where = f"on {args.sim_backend}{processes}, learning on {about['device']}"
+    bar.write(f"{args.env_id}: {args.num_envs} environments {where}")
     bar.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
 
     def log(kind: str, metrics: dict) -> None:

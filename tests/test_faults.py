@@ -503,7 +503,7 @@ def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd):
 def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch):
     """The pool, and one environment in the process: stopped by kill -9 or a signal, the same as never stopped."""
     monkeypatch.chdir(tmp_path)
-    for num_envs, signum in ((4, signal.SIGTERM), (1, signal.SIGKILL)):
+    for num_envs, signum in ((2, signal.SIGTERM), (1, signal.SIGKILL)):
         flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_steps", 20,
                  "--total_timesteps", 10 * 20 * num_envs, "--eval_freq", 7, "--num_eval_episodes", 1,
                  "--env_kwargs", '{"max_episode_steps": 15}']  # fmt: skip
