@@ -1533,7 +1533,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     @cuda_graph
     @torch.no_grad()
     def estimate_advantages():
-        for mb_obs, mb_values in zip(*[x.split(share.minibatch_size) for x in (batch[0], batch[-1])]):
+        for mb_obs, mb_values in zip(*[x.flatten(0, 1).split(share.minibatch_size) for x in (obs, values)]):
             mb_values.copy_(agent.get_value(mb_obs))  # for which no step had to wait
         following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
         next_values.copy_(torch.where(dones.bool(), next_values, following))

@@ -12,7 +12,6 @@ networks' matrices take alone at the same shapes, and, on a GPU, of launching as
 import argparse
 import contextlib
 import io
-import json
 import statistics
 import sys
 import tempfile
@@ -81,8 +80,7 @@ def train(flags, warm_up):
                                "--num_eval_episodes", "1", "--target_kl", "None", "--no-capture_video"])  # fmt: skip
         with contextlib.ExitStack() as closing:
             ppo.train(args, closing)
-        rows = [json.loads(line) for line in Path(f"{folder}/x/metrics.jsonl").read_text().splitlines()]
-    return [row for row in rows if row["kind"] == "train"][warm_up:]
+        return [row for row in ppo.read_metrics(Path(folder) / "x") if row["kind"] == "train"][warm_up:]
 
 
 def run(flags, warm_up):
