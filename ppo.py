@@ -50,6 +50,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
@@ -69,6 +70,7 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 import torch.nn as nn
 import tyro
+from sapien import physx
 from torch.distributions import Normal
 from tqdm import tqdm
 
@@ -107,11 +109,16 @@ if RENDER_DEVICE is None:
 
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.render.utils import can_render
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.structs import Articulation, Pose
+from mani_skill.utils.structs import Link
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -128,27 +135,6 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
-
-# Most of a step of one CPU-simulated environment is ManiSkill's Python, and much of that these two functions, for the
-# copies they make of each number: here are the same numbers with fewer.
-create_pose, set_joint_drive_targets = Pose.create, Articulation.set_joint_drive_targets
-
-
-def create_pose_at_once(pose, device=None) -> Pose:
-    if not (isinstance(pose, list) and isinstance(pose[0], sapien.Pose)):
-        return create_pose(pose, device)
-    return Pose(torch.from_numpy(np.array([np.concatenate((p.p, p.q)) for p in pose])).to(device))
-
-
-def set_joint_drive_targets_at_once(self, targets, joints=None, joint_indices=None) -> None:
-    if self.scene.gpu_sim_enabled or not isinstance(targets, torch.Tensor):
-        return set_joint_drive_targets(self, targets, joints, joint_indices)
-    for joint, target in zip(joints, targets[0].numpy()[:, None]):
-        joint._objs[0].drive_target = target
-
-
-Pose.create = staticmethod(create_pose_at_once)
-Articulation.set_joint_drive_targets = set_joint_drive_targets_at_once
 
 # what concerns no user: the render device is replaced above, robots are as they are
 NOISE = "Requested to use render device|mani_skill is not installed with git|"
@@ -616,6 +602,394 @@ def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None
             conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
     for env in envs:
         env.close()
+
+
+# ----- Batched CPU simulation -----------------------------------------------------------------------------------------
+
+
+class Array:
+    """What SAPIEN's CUDA arrays are to ManiSkill: something with .torch(). `refresh` fills an outdated one."""
+
+    def __init__(self, *shape: int, refresh=None):
+        self.data = torch.zeros(shape)
+        self.applied = torch.zeros(shape)  # what the simulation has of it
+        self.refresh, self.outdated = refresh, False
+
+    def fetch(self, rows, columns, values: torch.Tensor) -> None:
+        self.data[rows, columns] = values
+        self.applied[rows, columns] = values
+
+    def changes(self, rows=slice(None), columns=slice(None)) -> torch.Tensor:
+        """Where the tensor was written since it was fetched or applied: bool, of these rows and columns. What was not
+        written is left alone in the simulation, to the last bit."""
+        changed = self.data[rows, columns] != self.applied[rows, columns]
+        if changed.any():
+            self.applied[rows, columns] = self.data[rows, columns]
+        return changed
+
+    def torch(self):
+        if self.outdated:
+            self.outdated = False
+            self.refresh()
+        return self.data
+
+
+class BatchedPhysx:
+    """One PhysxCpuSystem per environment behind the interface of SAPIEN's PhysxGpuSystem, with tensors on the CPU.
+
+    ManiSkill simulates a batch of environments through the tensors `cuda_*` of that interface: `gpu_apply_*` moves what
+    was written into the simulation, `gpu_fetch_*` moves what was simulated into the tensors. Each body has a row in
+    `cuda_rigid_body_data` (position, quaternion, linear and angular velocity: 13 numbers), first all free bodies, then
+    all links; each articulation has one in `cuda_articulation_*`, padded to the largest number of joints."""
+
+    __class__ = physx.PhysxGpuSystem  # so says isinstance
+
+    def __init__(self, scenes: list[sapien.Scene]):
+        self.scenes, self.systems = scenes, [scene.physx_system for scene in scenes]
+        for scene in scenes:
+            scene.batch = self
+
+    @property
+    def timestep(self) -> float:
+        return self.systems[0].timestep
+
+    @timestep.setter
+    def timestep(self, value: float):
+        for system in self.systems:
+            system.timestep = value
+
+    def gpu_init(self) -> None:
+        self.free = [body for system in self.systems for body in system.rigid_dynamic_components]
+        self.links = [link for system in self.systems for link in system.articulation_link_components]
+        self.articulations = [link.articulation for link in self.links if link.is_root]
+        self.joints = [articulation.active_joints for articulation in self.articulations]
+        self.row = {body: i for i, body in enumerate(self.free + self.links)}
+        self.articulation_row = {articulation: i for i, articulation in enumerate(self.articulations)}
+        self.root_rows = torch.tensor([self.row[link] for link in self.links if link.is_root], dtype=torch.long)
+        num_bodies, num_articulations = len(self.row), len(self.articulations)
+        max_dof = max([articulation.dof for articulation in self.articulations], default=0)
+        max_links = max([len(articulation.links) for articulation in self.articulations], default=0)
+        self.cuda_rigid_body_data = Array(num_bodies, 13)
+        self.cuda_rigid_body_force, self.cuda_rigid_body_torque = Array(num_bodies, 4), Array(num_bodies, 4)
+        for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel"):
+            setattr(self, f"cuda_articulation_{name}", Array(num_articulations, max_dof))
+        self.cuda_articulation_qacc = Array(num_articulations, max_dof, refresh=self._read_qacc)
+        self.cuda_articulation_link_incoming_joint_forces = Array(num_articulations, max_links, 6)
+
+        # Where the numbers stand in what pack() returns: for each free body, then each articulation of a scene, the
+        # quaternion (w first), position, linear and angular velocity; for articulations also positions, velocities and
+        # both kinds of drive targets of their joints.
+        free_at, roots_at, joints_at, end = [], [], [], 0
+        for system in self.systems:
+            for _ in system.rigid_dynamic_components:
+                free_at.append(end)
+                end += 13
+            for link in system.articulation_link_components:
+                if link.is_root:
+                    roots_at.append(end)
+                    joints_at.append(end + 13)
+                    end += 13 + 4 * link.articulation.dof
+        state = torch.tensor([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
+        self.free_columns = torch.tensor(free_at, dtype=torch.long)[:, None] + state
+        self.root_columns = torch.tensor(roots_at, dtype=torch.long)[:, None] + state[7:]
+        self.joint_columns = torch.full((2, num_articulations, max_dof), end)  # for padding: a zero at the end
+        for i, articulation in enumerate(self.articulations):
+            positions = joints_at[i] + torch.arange(articulation.dof)
+            self.joint_columns[0, i, : articulation.dof] = positions
+            self.joint_columns[1, i, : articulation.dof] = positions + articulation.dof
+        self.num_packed_poses, self.moved = None, True
+        self.gpu_fetch_rigid_dynamic_data()
+        self.gpu_fetch_articulation_link_pose()
+        self.gpu_fetch_articulation_qpos()
+        self.gpu_fetch_articulation_qvel()
+
+    def step(self) -> None:
+        self.gpu_apply_articulation_target_position()
+        self.gpu_apply_articulation_target_velocity()
+        for system in self.systems:
+            system.step()
+        self.moved = True
+
+    # --- from the simulation to the tensors ---
+
+    def _pack(self) -> None:
+        """Read the whole state of all scenes, unless nothing has moved since."""
+        if not self.moved:
+            return
+        self.moved, self.contacts = False, None
+        self.cuda_articulation_qacc.outdated = True
+        packed = bytearray().join([*(system.pack() for system in self.systems), bytes(4)])
+        self.packed = torch.frombuffer(packed, dtype=torch.float32)
+        packed_poses = [scene.pack_poses() for scene in self.scenes]
+        if sum(map(len, packed_poses)) != self.num_packed_poses:  # lights and cameras may be added at any time
+            self._find_links([len(poses) // 4 for poses in packed_poses])
+            self.num_packed_poses = sum(map(len, packed_poses))
+        if self.links:
+            self.packed_poses = torch.frombuffer(bytearray().join(packed_poses), dtype=torch.float32)
+
+    def _find_links(self, sizes: list[int]) -> None:
+        """Where each link's pose stands in what pack_poses() returns: quaternion and position of each entity."""
+        starts = np.cumsum([0, *sizes])
+        entity_at = {}
+        for scene, start in zip(self.scenes, starts):
+            entity_at |= {entity: start + 7 * i for i, entity in enumerate(scene.entities)}
+        links_at = torch.tensor([int(entity_at[link.entity]) for link in self.links], dtype=torch.long)
+        self.link_columns = links_at[:, None] + torch.tensor([4, 5, 6, 0, 1, 2, 3])
+
+    def gpu_fetch_rigid_dynamic_data(self) -> None:
+        self._pack()
+        self.cuda_rigid_body_data.fetch(slice(0, len(self.free)), slice(None), self.packed[self.free_columns])
+
+    def gpu_fetch_articulation_link_pose(self) -> None:
+        self._pack()
+        if self.links:
+            poses = self.packed_poses[self.link_columns]
+            self.cuda_rigid_body_data.fetch(slice(len(self.free), None), slice(0, 7), poses)
+
+    def gpu_fetch_articulation_link_velocity(self) -> None:
+        """Of the roots; `read_velocities` gets those of other links, for which few tasks ask."""
+        self._pack()
+        self.cuda_rigid_body_data.fetch(self.root_rows, slice(7, 13), self.packed[self.root_columns])
+
+    def read_velocities(self, links: list) -> None:
+        rows = [self.row[link] for link in links if not link.is_root]
+        if rows:
+            velocities = np.array([[*link.linear_velocity, *link.angular_velocity] for link in links])
+            self.cuda_rigid_body_data.data[rows, 7:] = torch.from_numpy(velocities).float()
+
+    def gpu_fetch_articulation_qpos(self) -> None:
+        self._pack()
+        self.cuda_articulation_qpos.fetch(slice(None), slice(None), self.packed[self.joint_columns[0]])
+
+    def gpu_fetch_articulation_qvel(self) -> None:
+        self._pack()
+        self.cuda_articulation_qvel.fetch(slice(None), slice(None), self.packed[self.joint_columns[1]])
+
+    def _read_qacc(self) -> None:
+        for articulation, row in zip(self.articulations, self.cuda_articulation_qacc.data):
+            row[: articulation.dof] = torch.from_numpy(articulation.qacc)
+
+    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
+        for articulation, row in zip(self.articulations, self.cuda_articulation_link_incoming_joint_forces.data):
+            row[: len(articulation.links)] = torch.from_numpy(articulation.get_link_incoming_joint_forces())
+
+    # --- from the tensors to the simulation ---
+
+    def gpu_apply_rigid_dynamic_data(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(slice(0, len(self.free)))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            body, row = self.free[i], self.cuda_rigid_body_data.data[i].numpy()
+            if changed[i, :7].any():
+                body.pose = sapien.Pose(row[:3], row[3:7])
+            if not body.kinematic and changed[i, 7:].any():
+                body.linear_velocity, body.angular_velocity = row[7:10], row[10:13]
+            self.moved = True
+
+    def gpu_apply_articulation_root_pose(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(0, 7))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
+            self.articulations[i].root_pose = sapien.Pose(row[:3], row[3:7])
+            self.moved = True
+
+    def gpu_apply_articulation_root_velocity(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(7, 13))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
+            self.articulations[i].root_linear_velocity = row[7:10]
+            self.articulations[i].root_angular_velocity = row[10:13]
+            self.moved = True
+
+    def _apply(self, name: str) -> None:
+        array = getattr(self, f"cuda_articulation_{name}")
+        for i in array.changes().any(dim=1).nonzero().flatten().tolist():
+            setattr(self.articulations[i], name, array.data[i, : self.articulations[i].dof].numpy())
+            self.moved = True
+
+    def gpu_apply_articulation_qpos(self) -> None:
+        self._apply("qpos")
+
+    def gpu_apply_articulation_qvel(self) -> None:
+        self._apply("qvel")
+
+    def gpu_apply_articulation_qf(self) -> None:
+        self._apply("qf")
+
+    def _apply_targets(self, name: str, set_target) -> None:
+        array = getattr(self, f"cuda_articulation_{name}")
+        changed = array.changes()
+        if changed.any():
+            targets = array.data.tolist()
+            for i, j in changed.nonzero().tolist():
+                set_target(self.joints[i][j], targets[i][j])
+
+    def gpu_apply_articulation_target_position(self) -> None:
+        self._apply_targets("target_qpos", physx.PhysxArticulationJoint.set_drive_target)
+
+    def gpu_apply_articulation_target_velocity(self) -> None:
+        self._apply_targets("target_qvel", physx.PhysxArticulationJoint.set_drive_velocity_target)
+
+    def gpu_apply_rigid_dynamic_force(self) -> None:
+        """Forces act once, at the centre of mass."""
+        forces = self.cuda_rigid_body_force.data
+        for body, i in self.row.items():
+            if forces[i].any():
+                body.add_force_at_point(forces[i, :3].numpy(), (body.pose * body.cmass_local_pose).p)
+        forces.zero_()
+
+    def gpu_apply_rigid_dynamic_torque(self) -> None:
+        torques = self.cuda_rigid_body_torque.data
+        for body, i in self.row.items():
+            if torques[i].any():
+                body.add_force_torque(np.zeros(3, np.float32), torques[i, :3].numpy())
+        torques.zero_()
+
+    # --- contacts: asked of the simulation only where a task asks ---
+
+    def get_contacts(self) -> list:
+        if self.contacts is None:
+            self.contacts = [contact for system in self.systems for contact in system.get_contacts()]
+        return self.contacts
+
+    def gpu_create_contact_pair_impulse_query(self, pairs: list[tuple]):
+        return SimpleNamespace(rows={pair: i for i, pair in enumerate(pairs)}, cuda_impulses=Array(len(pairs), 3))
+
+    def gpu_query_contact_pair_impulses(self, query) -> None:
+        """Impulse on the first body of each pair from the second."""
+        impulses = query.cuda_impulses.data.zero_()
+        for contact in self.get_contacts():
+            first, second = contact.bodies
+            if (first, second) in query.rows:
+                impulses[query.rows[first, second]] += total_impulse(contact)
+            elif (second, first) in query.rows:
+                impulses[query.rows[second, first]] -= total_impulse(contact)
+
+    def gpu_create_contact_body_impulse_query(self, bodies: list):
+        return SimpleNamespace(rows={body: i for i, body in enumerate(bodies)}, cuda_impulses=Array(len(bodies), 3))
+
+    def gpu_query_contact_body_impulses(self, query) -> None:
+        impulses = query.cuda_impulses.data.zero_()
+        for contact in self.get_contacts():
+            for body, sign in zip(contact.bodies, (1, -1)):
+                if body in query.rows:
+                    impulses[query.rows[body]] += sign * total_impulse(contact)
+
+    # --- what a CPU simulation need not do ---
+
+    def get_scene_offset(self, scene) -> list[float]:
+        return [0.0, 0.0, 0.0]  # each scene is a world of its own
+
+    def _nothing(self) -> None:
+        pass
+
+    gpu_fetch_articulation_qacc = gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
+    gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
+
+
+def total_impulse(contact) -> torch.Tensor:
+    return torch.from_numpy(np.sum([point.impulse for point in contact.points], axis=0, dtype=np.float32))
+
+
+class BatchedRenderer:
+    """Stands for SAPIEN's RenderSystemGroup: the cameras of all scenes, one after the other, on any Vulkan device."""
+
+    def __init__(self, scenes: list[sapien.Scene]):
+        self.scenes = scenes
+
+    def update_render(self) -> None:
+        for scene in self.scenes:
+            scene.update_render()
+
+    def create_camera_group(self, cameras: list, names: list[str]):
+        return BatchedCamera(cameras)
+
+
+class BatchedCamera:
+    def __init__(self, cameras: list):
+        self.cameras = cameras
+
+    def take_picture(self) -> None:
+        for camera in self.cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> SimpleNamespace:
+        pictures = torch.from_numpy(np.stack([camera.get_picture(name) for camera in self.cameras]))
+        return SimpleNamespace(torch=lambda: pictures)
+
+
+def is_batch(scene: ManiSkillScene) -> bool:
+    return type(scene.px) is BatchedPhysx
+
+
+def batch_on_cpu() -> None:
+    """Let gym.make(task, num_envs=N, sim_backend="physx_cpu") build a batch, with the contract of physx_cuda. What
+    ManiSkill does with one environment, or on a GPU, stays as it is."""
+    setup_scene, reset = sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset
+    body_data = PhysxRigidBodyComponentStruct._body_data
+    set_action, compute_ik = PDEEPosController.set_action, Kinematics.compute_ik
+
+    def setup_batch(env):
+        if env.num_envs == 1 or env._sim_device.is_cuda():
+            return setup_scene(env)
+        env._set_scene_config()
+        rendered = can_render(env._render_device)
+        scenes = []
+        for _ in range(env.num_envs):
+            renderer = [sapien.render.RenderSystem(env._render_device)] if rendered else []
+            scenes.append(sapien.Scene([physx.PhysxCpuSystem(), *renderer]))
+        env.scene = ManiSkillScene(scenes, sim_config=env.sim_config, device=env.device, backend=env.backend)
+        env.scene.px, env.scene.gpu_sim_enabled = BatchedPhysx(scenes), True
+        env.scene.render_system_group = BatchedRenderer(scenes)
+        env.scene.px.timestep = 1 / env._sim_freq
+
+    def reset_from_own_seeds(env, seed=None, options=None):
+        if env._last_obs is None and env.num_envs > 1:  # it is being made
+            seed = [env.build_seed + i for i in range(env.num_envs)]
+        return reset(env, seed=seed, options=options)
+
+    def body_data_with_velocities(struct):
+        if isinstance(struct, Link) and is_batch(struct.scene):
+            struct.px.read_velocities(struct._objs)
+        return body_data.fget(struct)
+
+    def set_action_by_pose(controller, action):
+        """The solver for one environment wants a pose to reach, not a change of pose."""
+        scene = controller.scene
+        if is_batch(scene):
+            controller.scene = SimpleNamespace(gpu_sim_enabled=False, num_envs=scene.num_envs)
+        try:
+            set_action(controller, action)
+        finally:
+            controller.scene = scene
+
+    def compute_ik_by_row(kinematics, pose, q0, **kwargs):
+        if kinematics.use_gpu_ik or len(q0) == 1:
+            return compute_ik(kinematics, pose, q0, **kwargs)
+        controlled = kinematics.active_joint_indices
+        solutions = [compute_ik(kinematics, pose[i : i + 1], q0[i : i + 1]) for i in range(len(q0))]
+        return torch.cat([q0[i, controlled][None] if x is None else x for i, x in enumerate(solutions)])
+
+    def row_of(cls, name, table, scene_of):
+        """ManiSkill asks bodies and articulations for their rows in the tensors."""
+        index = getattr(cls, name)
+
+        def find(component):
+            batch = getattr(scene_of(component), "batch", None)
+            return getattr(batch, table)[component] if batch else index.fget(component)
+
+        setattr(cls, name, property(find))
+
+    row_of(physx.PhysxRigidDynamicComponent, "gpu_pose_index", "row", lambda body: body.entity.scene)
+    row_of(physx.PhysxArticulationLinkComponent, "gpu_pose_index", "row", lambda link: link.entity.scene)
+    row_of(physx.PhysxArticulation, "gpu_index", "articulation_row", lambda robot: robot.root.entity.scene)
+    sapien_env.CPU_SIM_BACKENDS = set()  # for which ManiSkill refuses more than one environment
+    sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset = setup_batch, reset_from_own_seeds
+    sapien_env.BaseEnv.build_seed = 2022  # ManiSkill's; a run sets its own, so that its processes build other objects
+    PhysxRigidBodyComponentStruct._body_data = property(body_data_with_velocities)
+    PDEEPosController.set_action, Kinematics.compute_ik = set_action_by_pose, compute_ik_by_row
+
+
+batch_on_cpu()
 
 
 def to_device(x, device):
