@@ -32,6 +32,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import io
+import itertools
 import json
 import math
 import os
@@ -39,6 +40,7 @@ import platform
 import random
 import re
 import shlex
+import shutil
 import signal
 import sys
 import tempfile
@@ -53,12 +55,21 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
 
+# Idle OpenMP threads spin, on cores that the simulation or other work needs: let them sleep soon
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "300")
+
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
     "ignore",
     message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True|"
     "Synchronization debug mode is a prototype",
 )
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None
 
 import gymnasium as gym
 import numpy as np
@@ -174,21 +185,23 @@ class Args:
     reward_mode: Optional[Literal["normalized_dense", "dense", "sparse", "none"]] = None
     """what is learned from (None: the first of these that the task has)"""
     sim_backend: str = "auto"
-    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
+    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu, or auto"""
     render_backend: str = "gpu"
     """where videos are rendered: gpu (gpu:1), cpu or none; what is not there is replaced by what is"""
     num_envs: int = 512
-    """parallel training environments (on a CPU: 8 a core)"""
+    """parallel training environments (on a CPU: 16 a core)"""
     num_eval_envs: int = 16
-    """parallel evaluation environments (on a CPU: 4 a core)"""
+    """parallel evaluation environments (on a CPU: 16 a core)"""
+    num_actors: Optional[int] = None
+    """processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
     """end a training episode at success or failure; --no-partial_reset: at the time limit only"""
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
-    """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
+    """rebuild training scenes every so many resets (None: the task's own); a batch needs --no-partial_reset for it"""
     eval_reconfiguration_freq: Optional[int] = None
-    """rebuild evaluation scenes every so many resets; 1 suits tasks that vary their objects"""
+    """rebuild evaluation scenes every so many resets (None: 1 for tasks that vary their objects, else 0: never)"""
     render_mode: Literal["rgb_array", "sensors", "all"] = "rgb_array"
     """what videos show: rgb_array (the scene), sensors (the task's cameras) or all"""
     shader: Literal["minimal", "default", "rt-fast", "rt-med", "rt"] = "default"
@@ -274,9 +287,9 @@ class Args:
     capture_video: bool = True
     """film the first episodes of each evaluation, where there is a renderer"""
     save_train_video_freq: Optional[int] = None
-    """film training every so many iterations (on a GPU all environments, as tiles: keep num_envs small)"""
+    """film the policy as it explores in training, every so many iterations"""
     save_trajectory: bool = False
-    """write evaluation episodes as ManiSkill trajectories, beside the videos: one file, or on a CPU one an environment
+    """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor
     (python -m mani_skill.trajectory.merge_trajectory joins them)"""
 
     # --- runtime ---
@@ -305,6 +318,7 @@ class Args:
         return replace(
             self, num_envs=self.num_envs // WORLD_SIZE, num_eval_envs=math.ceil(self.num_eval_envs / WORLD_SIZE),
             num_eval_episodes=math.ceil(self.num_eval_episodes / WORLD_SIZE), sim_backend=backend,
+            num_actors=max(1, self.num_actors // WORLD_SIZE),
             **{} if RANK == 0 else dict(
                 capture_video=False, save_train_video_freq=None, save_trajectory=False, save_model=False, track=False
             ),
@@ -318,7 +332,9 @@ CPU_DEFAULTS = dict(
 
 # --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
 # of the network from the checkpoint; a resumed run may be given only some anew
-OF_THE_MACHINE = {"cuda", "sim_backend", "render_backend", "num_eval_envs", "capture_video", "save_trajectory", "track"}
+OF_THE_MACHINE = {
+    "cuda", "sim_backend", "render_backend", "num_eval_envs", "num_actors", "capture_video", "save_trajectory", "track"
+}  # fmt: skip
 OF_THE_NETWORK = ("norm_obs", "shared_features")
 MAY_CHANGE = OF_THE_MACHINE | {
     "total_timesteps", "stop_at_success", "eval_freq", "save_model", "save_freq", "checkpoint_freq",
@@ -390,7 +406,7 @@ def parse_args(argv: list[str]) -> Args:
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
         cores = num_cores() * WORLD_SIZE
-        default = replace(default, **CPU_DEFAULTS, num_envs=8 * cores, num_eval_envs=4 * cores)
+        default = replace(default, **CPU_DEFAULTS, num_envs=16 * cores, num_eval_envs=16 * cores)
     if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
@@ -408,6 +424,9 @@ def parse_args(argv: list[str]) -> Args:
         args.resume = str(find_checkpoint(args.resume))
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+    if args.num_actors is None:
+        cores = num_cores() * WORLD_SIZE if args.sim_backend == "physx_cpu" else WORLD_SIZE
+        args.num_actors = max(1, min(cores, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     return args
@@ -445,59 +464,78 @@ def default_reward_mode(task) -> str:
     return next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in task.SUPPORTED_REWARD_MODES)
 
 
-class Recorder(RecordEpisode):
-    def flush_video(self, *args, **kwargs):
-        try:
-            super().flush_video(*args, **kwargs)
-        except OSError as error:  # such as a full disk
-            print(f"a video could not be written, the run goes on: {error}", flush=True)
-            self.render_images, self._video_steps = [], 0
+def varies_objects(task) -> bool:
+    """Whether a task builds other objects for each episode of a single environment. ManiSkill's tasks then take
+    reconfiguration_freq, to switch that off for batches."""
+    return "reconfiguration_freq" in inspect.signature(task.cls.__init__).parameters
 
 
-def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
-    """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
-    `index` tells it from the others and only the first is filmed."""
-    video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
-    trajectory = evaluation and args.save_trajectory
+def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
+    """`num_envs` environments of the task as one ManiSkill environment: a batch, or on a CPU also a single one."""
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
         control_mode=args.control_mode,
         robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
         reward_mode=args.reward_mode or default_reward_mode(find_task(args.env_id).cls),
-        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
+        reconfiguration_freq=0 if evaluation else args.reconfiguration_freq,  # `evaluate` rebuilds its scenes itself
         sim_backend=args.sim_backend,
-        render_backend=args.render_backend if video else "none",
-        render_mode=args.render_mode if video else None,
-        human_render_camera_configs=dict(shader_pack=args.shader) if video else None,
+        render_backend=args.render_backend if film else "none",
+        render_mode=args.render_mode if film else None,
+        human_render_camera_configs=dict(shader_pack=args.shader) if film else None,
     )
     kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
     env = gym.make(args.env_id, **kwargs)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = FlattenActionSpaceWrapper(env)
-    if video or trajectory:
-        base_env, rounds_filmed = env.unwrapped, 4 if args.evaluate else 1
-
-        def is_filmed(step):
-            if evaluation:  # its first episodes, which the seeds tell
-                return base_env._episode_seed[0] < args.eval_seed + rounds_filmed * args.num_eval_envs
-            return step // args.num_steps % args.save_train_video_freq == 0
-
-        env = Recorder(
-            env,
-            output_dir=str(record_dir),
-            save_video=video,
-            save_video_trigger=is_filmed,
-            save_on_reset=evaluation,
-            avoid_overwriting_video=not evaluation,
-            max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
-            video_fps=base_env.control_freq,
-            save_trajectory=trajectory,
-            trajectory_name=f"trajectory_{index}",
-            source_type="rl",
-            source_desc="PPO",
-        )
     return env
+
+
+def make_envs(args: Args, num_envs: int, seed: int, evaluation: bool = False, record=None) -> ManiSkillVectorEnv:
+    """Environments with ManiSkill's interface for a batch. Those for evaluation do not reset by themselves: `evaluate`
+    starts each episode from its seed.
+
+    Args:
+        seed: what the objects of a batch are built from, in tasks that vary them.
+        record: arguments of RecordEpisode, to film the environments or to write their trajectories."""
+    sapien_env.BaseEnv.build_seed = seed
+    env = make_env(args, num_envs, evaluation, film=bool(record and record["save_video"]))
+    if record:
+        env = RecordEpisode(env, save_on_reset=True, source_type="rl", source_desc="PPO", **record)
+    return ManiSkillVectorEnv(
+        env,
+        auto_reset=not evaluation,
+        ignore_terminations=not (args.eval_partial_reset if evaluation else args.partial_reset),
+        record_metrics=True,
+    )
+
+
+def rebuilding(args: Args) -> int:
+    """In every how many rounds of an evaluation its scenes are rebuilt."""
+    if args.eval_reconfiguration_freq is not None:
+        return args.eval_reconfiguration_freq
+    return int(varies_objects(find_task(args.env_id)) or args.exact_resume and args.sim_backend == "physx_cpu")
+
+
+def can_reset_some(envs: ManiSkillVectorEnv) -> bool:
+    """Whether the task can reset some of several environments: a few of ManiSkill's fail."""
+    try:
+        envs.reset(options=dict(env_idx=torch.zeros(1, dtype=torch.long, device=envs.device)))
+    except (RuntimeError, IndexError, ValueError, AssertionError):
+        return envs.num_envs == 1
+    return True
+
+
+def start_episodes(envs: ManiSkillVectorEnv, seeds: list[int], separately: bool):
+    """Start an episode from each seed; returns the first observations. ManiSkill draws a batch from its first seed:
+    `separately` resets each environment by itself, so that each episode follows from its own seed alone."""
+    if not separately:
+        return envs.reset(seed=seeds)[0]
+    for i, seed in enumerate(seeds):
+        obs, _ = envs.reset(seed=[seed] * len(seeds), options=dict(env_idx=torch.tensor([i])))
+    envs.base_env._set_main_rng(seeds)
+    envs.base_env._set_episode_rng(seeds, torch.arange(len(seeds)))  # for what a task draws during its episodes
+    return obs
 
 
 def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
@@ -516,92 +554,34 @@ def seed_all(*numbers: int) -> None:
     torch.manual_seed(seed)
 
 
-def stream_seed(seed: int) -> int:
-    """Seed of the random stream from which episodes without a seed follow one with `seed`. ManiSkill draws that one
-    from `seed` itself, so the others need a different one; like all seeds of training it is at least 2^31."""
-    return int(np.random.SeedSequence(seed).generate_state(1)[0]) | 2**31
-
-
 def as_dict(obs) -> dict:
     """Observations by name, also where there is one only."""
     return obs if isinstance(obs, (dict, gym.spaces.Dict)) else {"state": obs}
 
 
-def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
-    """Body of a worker process: build the environments `indices`, then answer each message with one message.
+class Film:
+    """A small batch of its own that is rendered: it plays the first evaluation episodes again, into videos."""
 
-    Each environment has its own stream of torch random numbers, so that its episodes depend on neither its neighbours
-    nor the number of workers."""
-    torch.set_num_threads(1)
-    torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
+    def __init__(self, args: Args, folder: Path):
+        self.args, self.folder, self.envs = args, folder, None
+        self.num_envs = 1 if args.sim_backend == "physx_cpu" else 4
 
-    envs, streams = [], []
+    def record(self, agent, name: str, num_steps: int, seed: int, exploring: bool = False) -> None:
+        """Write episodes that start from `seed` on as <folder>/<name>.mp4."""
+        if self.envs is None:
+            video = dict(output_dir=str(self.folder), save_video=True, save_trajectory=False, max_steps_per_video=10**9)
+            self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, record=video)
+            self.envs._env.video_fps = self.envs.base_env.control_freq
+        evaluate(agent, self.envs, self.num_envs, seed, num_steps, rebuilding(self.args), exploring=exploring)
+        try:
+            self.envs._env.flush_video(name=name)
+        except OSError as error:  # such as a full disk
+            print(f"a video could not be written, the run goes on: {error}", flush=True)
+            self.envs._env.render_images, self.envs._env._video_steps = [], 0
 
-    def in_own_stream(i, function, *args, **kwargs):
-        torch.set_rng_state(streams[i])
-        result = function(*args, **kwargs)
-        streams[i] = torch.get_rng_state()
-        return result
-
-    def batch(infos):
-        return {
-            k: (torch.cat if v.ndim else torch.stack)([info[k] for info in infos]).numpy()
-            if isinstance(v, torch.Tensor)
-            else v
-            for k, v in (infos[0].items() if infos else ())
-        }
-
-    def reset(rows, seeds=None, options=None):
-        infos = []
-        for i in rows:
-            seed = None if seeds is None else seeds[i]
-            if seed is not None:
-                streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
-                np.random.seed(seed)
-                random.seed(seed)
-            first_obs, info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
-            for k, v in as_dict(first_obs).items():
-                reset_obs[k][i] = v[0]
-            infos.append(info)
-        return batch(infos)
-
-    try:
-        for index in indices:
-            torch.manual_seed(index)
-            np.random.seed(index)
-            envs.append(make_env(index))
-            streams.append(torch.get_rng_state())
-            conn.send("built")
-        spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
-        conn.send((spaces, find_max_episode_steps_value(envs[0])))
-        share = slice(indices[0], indices[-1] + 1)
-        obs, reset_obs, *others = conn.recv()
-        obs, reset_obs = [{k: v[share] for k, v in buffers.items()} for buffers in (obs, reset_obs)]
-        rewards, terminated, truncated, actions = [buffer[share] for buffer in others]
-        while True:
-            try:
-                command, *arguments = conn.recv()
-            except EOFError:  # the main process closed the pipe
-                break
-            if command == "step":
-                results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
-                next_obs, *tensors, infos = zip(*results)
-                for k, buffer in obs.items():
-                    torch.cat([as_dict(x)[k] for x in next_obs], out=buffer)
-                for buffer, rows in zip((rewards, terminated, truncated), tensors):
-                    torch.cat(rows, out=buffer)
-                infos = batch(infos)  # before the resets, which write into the same tensors
-                ended = truncated if ignore_terminations else terminated | truncated
-                conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
-            else:
-                conn.send(reset(*arguments))
-    except ConnectionError:
-        pass  # it did so while it was to be answered, or is gone
-    except BaseException:
-        with contextlib.suppress(ConnectionError):
-            conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
-    for env in envs:
-        env.close()
+    def close(self) -> None:
+        if self.envs is not None:
+            self.envs.close()
 
 
 # ----- Batched CPU simulation -----------------------------------------------------------------------------------------
@@ -992,169 +972,175 @@ def batch_on_cpu() -> None:
 batch_on_cpu()
 
 
-def to_device(x, device):
-    """A tensor, or a dict of them, on the device; from the CPU without waiting for it."""
-    if isinstance(x, dict):
-        return {k: to_device(v, device) for k, v in x.items()}
-    if x.device.type == "cpu" and device.type == "cuda":
-        return x.pin_memory().to(device, non_blocking=True)
-    return x.to(device)
+# ----- Actors ---------------------------------------------------------------------------------------------------------
 
 
-class CPUVectorEnv(gym.Env):
-    """`num_envs` CPU-simulated environments as one batched environment, to be wrapped by ManiSkillVectorEnv.
+def part(total: int, index: int, parts: int) -> range:
+    """What falls to one of several when `total` things are shared out."""
+    return range(total * index // parts, total * (index + 1) // parts)
 
-    Worker processes, one a core, each step their share of the environments one after the other. Observations,
-    rewards, flags and actions pass through shared memory, and a step costs one message to each worker and one back:
-    with `auto_reset` a worker also resets the episodes that ended, so that the partial reset which ManiSkillVectorEnv
-    asks for next finds its work done.
 
-    Args:
-        make_env: picklable function from an index in [0, num_envs) to a ManiSkill environment with num_envs=1.
-        ignore_terminations: as given to ManiSkillVectorEnv: whether an episode ends at its time limit only.
-        description: what a progress bar calls the environments while they are built.
+class Actor:
+    """The environments of one process: their part of training, and their part of each evaluation.
 
-    Raises:
-        RunError: with the traceback or the exit code of a worker that failed.
-    """
+    Raises SystemExit, with one line, if the task cannot do what is asked of it."""
 
-    device = torch.device("cpu")
-    reconfiguration_freq = 0  # as a batch; each environment is a scene of its own and keeps its own frequency
+    def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
+        self.args, self.index = args, index
+        self.env_idx = part(args.num_envs, index, args.num_actors)
+        num_eval_envs = len(part(args.num_eval_envs, index, args.num_actors)) or 1
+        self.envs = None
+        if not args.evaluate:
+            seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
+            self.envs = make_envs(args, len(self.env_idx), seed)
+        record = None
+        if args.save_trajectory and trajectory_dir:
+            record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
+        first = RANK * args.num_eval_episodes + part(args.num_eval_episodes, index, args.num_actors).start
+        self.eval_envs = make_envs(args, num_eval_envs, args.eval_seed + first, evaluation=True, record=record)
+        self.separately = args.sim_backend == "physx_cpu" and can_reset_some(self.eval_envs)
 
-    def __init__(self, make_env, num_envs, num_workers, auto_reset=True, ignore_terminations=False, description=""):
-        self.num_envs, self.metadata = num_envs, {}
+    def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
+        """What to act with, and what to write into: this actor's columns."""
+        columns = slice(self.env_idx.start, self.env_idx.stop)
+        self.agent, self.storage = agent, storage and {k: v[:, columns] for k, v in storage.items()}
+        self.sample_action = sample_action or agent.sample_action
+
+    def rollout(self, iteration: int, restart: bool, rebuild: bool) -> tuple[dict, Optional[str]]:
+        """All noise follows from seed, iteration and actor. Returns what `rollout` does, and what was not finite."""
+        args = self.args
+        seed_all(args.seed, iteration, RANK, self.index)
+        if restart:
+            seeds = np.random.SeedSequence([args.seed, iteration, RANK]).generate_state(args.num_envs)
+            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+            options = dict(reconfigure=True) if rebuild else None
+            with torch.no_grad():
+                self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
+        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, args, self.sample_action)
+        quantities = {"observation": "obs", "reward": "rewards", "value": "next_values"}
+        shape = self.storage["rewards"].shape
+        finite = torch.stack([self.storage[k].isfinite().view(*shape, -1).all(-1).all(0) for k in quantities.values()])
+        if finite.all():
+            return sums, None
+        names = [name for name, row in zip(quantities, finite) if not row.all()]
+        broken = (~finite.all(0)).nonzero().flatten()
+        # scenes that ManiSkill rebuilds now and then are so all at once
+        self.obs, _ = self.envs.reset(options=None if args.reconfiguration_freq else dict(env_idx=broken))
+        env_idx = (broken.cpu() + self.env_idx.start).tolist()
+        return sums, f"non-finite {', '.join(names)} in environments {env_idx}"
+
+    def evaluate(self, num_episodes: int, seed: int, num_steps: int, rebuild: int) -> dict[str, torch.Tensor]:
+        """This actor's part of the episodes that start from `seed` on."""
+        episodes = part(num_episodes, self.index, self.args.num_actors)
+        first = seed + episodes.start
+        return evaluate(self.agent, self.eval_envs, len(episodes), first, num_steps, rebuild, self.separately)
+
+    def close(self) -> None:
+        for envs in (self.envs, self.eval_envs):
+            if envs is not None:
+                envs.close()
+
+
+def share_memory(agent: nn.Module, storage: dict) -> None:
+    """Move them to memory that all processes see, or refuse what does not fit there: it would end in a 'Bus error'."""
+    needed = sum(x.numel() * x.element_size() for x in [*agent.state_dict().values(), *storage.values()])
+    free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else math.inf
+    if needed > free:
+        fail(f"a rollout needs {needed / 2**20:,.0f} MiB of shared memory, and {free / 2**20:,.0f} are free: give the "
+             "container more (--shm-size), or use fewer environments or steps, or --num_actors 1")  # fmt: skip
+    agent.share_memory()
+    for x in storage.values():
+        x.share_memory_()
+
+
+def run_actor(conn, *arguments) -> None:
+    """Body of a further process: build an actor, then answer each message, a method and its arguments, with one."""
+    torch.set_num_threads(1)
+    try:
+        actor = Actor(*arguments)
+        conn.send("built")
+        while True:
+            try:
+                method, *rest = conn.recv()
+            except EOFError:  # the main process closed the pipe, or is gone
+                break
+            conn.send(getattr(actor, method)(*rest))
+        actor.close()
+    except ConnectionError:
+        pass  # the main process is gone
+    except BaseException:
+        with contextlib.suppress(ConnectionError):
+            conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
+
+
+class Actors:
+    """Actor 0, in this process, and with CPU simulation further ones in processes of their own.
+
+    Raises RunError, with the traceback or the exit code, where one of them fails."""
+
+    def __init__(self, args: Args, trajectory_dir: Path):
         context = mp.get_context("spawn")
-        self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
-        self.conns, self.workers = [], []
-        # inherited by the workers: to stop is for the main process alone to decide, whom it then tells
+        self.conns, self.processes = [], []
+        # inherited by the processes: they ignore these signals, and the main process tells them when to stop
         handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOP_SIGNALS}
-        for share in self.shares:
-            conn, worker_conn = context.Pipe()
-            worker = context.Process(
-                target=cpu_worker, args=(worker_conn, make_env, share, auto_reset, ignore_terminations), daemon=True
-            )
-            worker.start()
-            worker_conn.close()  # so that a dead worker reads as the end of its pipe
+        for index in range(1, args.num_actors):
+            conn, other_end = context.Pipe()
+            process = context.Process(target=run_actor, args=(other_end, args, index, trajectory_dir), daemon=True)
+            process.start()
+            other_end.close()  # so that a dead process reads as the end of its pipe
             self.conns.append(conn)
-            self.workers.append(worker)
+            self.processes.append(process)
         for s, handler in handlers.items():
             signal.signal(s, handler)
         try:
-            with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
-                for i in range(len(self.shares[0])):
-                    for w, share in enumerate(self.shares):
-                        if i < len(share):
-                            self._receive(w)
-                            bar.update()
-            spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+            self.local = Actor(args, 0, trajectory_dir)
+            for i in range(len(self.conns)):
+                self._receive(i)
         except BaseException:
             self.close()
             raise
-        self.single_observation_space, self.single_action_space = spaces
-        self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
-        self.obs, self.reset_obs = [
-            {k: torch.from_numpy(np.zeros((num_envs, *s.shape), s.dtype)) for k, s in as_dict(spaces[0]).items()}
-            for _ in range(2)
-        ]
-        self.rewards, self.actions = torch.zeros(num_envs), torch.zeros(num_envs, *spaces[1].shape)
-        self.terminated, self.truncated = torch.zeros(2, num_envs, dtype=torch.bool)
-        buffers = [self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions]
-        for buffer in (*self.obs.values(), *self.reset_obs.values(), *buffers[2:]):
-            buffer.share_memory_()
-        self._send([buffers] * len(self.conns))
-        self.infos, self.reset_infos = {}, []
 
-    def _send(self, messages):
-        for conn, message in zip(self.conns, messages):
-            with contextlib.suppress(ConnectionError):  # _receive tells what became of the worker
-                conn.send(message)
-
-    def _receive(self, w):
+    def _receive(self, i: int):
         try:
-            message = self.conns[w].recv()
+            message = self.conns[i].recv()
         except (EOFError, ConnectionResetError):
-            self.workers[w].join(5)
-            code = self.workers[w].exitcode
-            message = RunError(f"died with exit code {code}" + " (killed; out of memory?)" * (code == -9))
+            self.processes[i].join(5)
+            code = self.processes[i].exitcode
+            message = RunError(f"died with exit code {code}" + (" (killed; out of memory?)" if code == -9 else ""))
         if isinstance(message, RunError):
-            raise RunError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}) {message}")
+            raise RunError(f"actor {i + 1} {message}")
         return message
 
-    @staticmethod
-    def _concatenate(infos):
-        return {
-            k: torch.from_numpy(np.concatenate([info[k] for info in infos])) if isinstance(v, np.ndarray) else v
-            for k, v in infos[0].items()
-        }
-
-    def _observation(self):
-        obs = {k: v.clone() for k, v in self.obs.items()}
-        return obs if isinstance(self.single_observation_space, gym.spaces.Dict) else obs["state"]
-
-    @property
-    def elapsed_steps(self) -> torch.Tensor:
-        return self.infos["elapsed_steps"]
-
-    def step(self, actions: torch.Tensor):
-        self.actions.copy_(actions)
-        self._send([("step",)] * len(self.conns))
-        infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
-        self.infos = self._concatenate(infos)
-        results = [x.clone() for x in (self.rewards, self.terminated, self.truncated)]
-        return self._observation(), *results, dict(self.infos)
-
-    def reset(self, *, seed=None, options=None):
-        options = dict(options or {})
-        env_idx = torch.as_tensor(options.pop("env_idx", range(self.num_envs))).sort().values
-        if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
-            if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
-                seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
-            chosen = [[i for i, index in enumerate(share) if (env_idx == index).any()] for share in self.shares]
-            seeds = [seed and [seed[index] for index in share] for share in self.shares]
-            self._send([("reset", rows, s, options) for rows, s in zip(chosen, seeds)])
-            self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
-        infos = self._concatenate([info for info in self.reset_infos if info])
-        self.reset_infos = []
-        for k, v in infos.items():
-            if isinstance(v, torch.Tensor) and len(env_idx) < self.num_envs:
-                infos[k] = self.infos[k].index_copy(0, env_idx, v)
-        self.infos = infos
-        for k, obs in self.obs.items():
-            obs[env_idx] = self.reset_obs[k][env_idx]
-        return self._observation(), dict(infos)
-
-    def close(self):
+    def _send(self, *message) -> None:
         for conn in self.conns:
-            conn.close()  # which is how a worker learns that it is over
-        for worker in self.workers:
-            worker.join(30)
-            worker.kill()
+            with contextlib.suppress(ConnectionError):  # _receive says what became of the process
+                conn.send(message)
 
+    def call(self, method: str, *arguments) -> list:
+        """Call a method of all actors at once; returns their results in order."""
+        self._send(method, *arguments)
+        result = getattr(self.local, method)(*arguments)
+        return [result, *(self._receive(i) for i in range(len(self.conns)))]
 
-def workers_memory(envs: ManiSkillVectorEnv) -> float:
-    """Resident memory in MiB of the worker processes, if any; RunError where one of them has died."""
-    if not isinstance(envs.base_env, CPUVectorEnv):
-        return 0.0
-    dead = [w for w, worker in enumerate(envs.base_env.workers) if not worker.is_alive()]
-    if dead:
-        envs.base_env._receive(dead[0])
-    return sum(psutil.Process(worker.pid).memory_info().rss for worker in envs.base_env.workers) / 2**20
+    def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
+        """Hand the weights and the storage to all, in shared memory where there are others."""
+        self._send("connect", agent, storage)
+        self.local.connect(agent, storage, sample_action)
+        for i in range(len(self.conns)):
+            self._receive(i)
 
+    def memory(self) -> float:
+        """Resident memory of the further processes in MiB."""
+        return sum(psutil.Process(process.pid).memory_info().rss for process in self.processes) / 2**20
 
-def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
-    """The training or the evaluation environments as one batch. Those for evaluation do not reset by themselves:
-    `evaluate` starts each episode from its seed."""
-    num_envs = args.num_eval_envs if evaluation else args.num_envs
-    ignore_terminations = not (args.eval_partial_reset if evaluation else args.partial_reset)
-    make = partial(make_env, args, record_dir, evaluation)
-    if args.sim_backend == "physx_cpu" and num_envs > 1:
-        what = "building evaluation environments" if evaluation else "building training environments"
-        env = CPUVectorEnv(make, num_envs, num_cores(), not evaluation, ignore_terminations, what)
-    else:
-        env = make(num_envs=num_envs)
-    return ManiSkillVectorEnv(
-        env, auto_reset=not evaluation, ignore_terminations=ignore_terminations, record_metrics=True
-    )
+    def close(self) -> None:
+        for conn in self.conns:
+            conn.close()  # by which an actor learns that it is over
+        if hasattr(self, "local"):
+            self.local.close()
+        for process in self.processes:
+            process.join(10)
+            process.kill()
 
 
 # ----- Agent ----------------------------------------------------------------------------------------------------------
@@ -1342,8 +1328,8 @@ def as_cuda_graph(function, enabled: bool):
     """`function`, launched as one CUDA graph: a network so small computes faster than its kernels can be launched one
     by one.
 
-    It takes no arguments, never makes the host wait, and finds the tensors that it reads and writes always in the same
-    place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
+    It takes nothing or an observation, never makes the host wait, and finds the tensors that it reads and writes always
+    in the same place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
     as capturing wants it, and the third looks whether the host waits, in which case it is never captured; the next one
     captures it, and those after that replay.
 
@@ -1352,29 +1338,36 @@ def as_cuda_graph(function, enabled: bool):
     if not enabled:
         return function
     graph, stream, num_calls, result, waits = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None, []
+    name, run, held = function.__name__, function, None
 
-    def launch():
-        nonlocal num_calls, result, waits
+    def launch(obs=None):
+        nonlocal num_calls, result, waits, run, held
         num_calls += 1
+        if obs is not None:
+            if held is None:
+                held = copy.deepcopy(obs)  # where the graph finds it
+                run = partial(function, held)
+            for k, v in as_dict(held).items():
+                v.copy_(as_dict(obs)[k])
         if num_calls <= 3:
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                result, waits = call_and_look_for_waits(function) if num_calls == 3 else (function(), [])
+                result, waits = call_and_look_for_waits(run) if num_calls == 3 else (run(), [])
             torch.cuda.current_stream().wait_stream(stream)
             if waits:
-                tqdm.write(f"{function.__name__}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
+                tqdm.write(f"{name}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
             return result
         if waits:
-            return function()
+            return run()
         if num_calls == 4:
             gc.collect()  # what is collected during the capture might free memory of the GPU, which ends the capture
             try:  # other threads, as those of NCCL, go on meanwhile
                 with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-                    result = function()
+                    result = run()
             except RuntimeError as error:
                 while error.__context__:  # what stopped it, rather than that it was stopped
                     error = error.__context__
-                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {error}") from None
+                raise RunError(f"{name}: no CUDA graph (try --no-cudagraphs): {error}") from None
         graph.replay()
         return result
 
@@ -1386,36 +1379,46 @@ def as_cuda_graph(function, enabled: bool):
 
 @torch.no_grad()
 def evaluate(
-    agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
+    agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild: int = 0, separately=False, exploring=False
 ) -> dict[str, torch.Tensor]:
-    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k (on a
-    GPU ManiSkill draws those of a batch from its first seed). Of several processes, each runs `num_episodes`, of seeds
-    that follow on each other.
+    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
+
+    Args:
+        rebuild: build new scenes, from the seeds too, in every so many rounds of all environments; 0: never.
+        separately: as `start_episodes` has it.
+        exploring: take random actions, as training does.
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
-    float tensor (num_episodes of all processes,) each, on the CPU."""
-    low, high = action_bounds(envs, device)
-    rounds = []
-    seed += RANK * num_episodes
+    float tensor (num_episodes,) each, on the CPU."""
+    low, high = action_bounds(envs, envs.device)
     seed_all(seed)  # for tasks that draw during an episode
+    rounds = []
     for first in range(seed, seed + num_episodes, envs.num_envs):
-        obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
+        seeds = list(range(first, first + envs.num_envs))
+        if rebuild and len(rounds) % rebuild == 0:
+            envs.reset(seed=seeds, options=dict(reconfigure=True))
+        obs = start_episodes(envs, seeds, separately)
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
         episodes = {}
         for step in range(1, num_steps + 1):
-            action = agent.get_action(to_device(obs, device)).clamp(low, high).nan_to_num()
-            obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
+            action = agent.sample_action(obs)[0] if exploring else agent.get_action(obs)
+            obs, _, terminated, truncated, infos = envs.step(action.clamp(low, high).nan_to_num())
             ended = running & (terminated | truncated | (step == num_steps))
             running &= ~ended
             at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
             for k, v in (infos["episode"] | at_end).items():
                 episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+        if isinstance(envs._env, RecordEpisode) and envs._env.save_trajectory:
+            envs._env.flush_trajectory()
         rounds.append(episodes)
-    share = {
-        k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"
-    }
-    parts = gather(share)
-    return {k: torch.cat([part[k] for part in parts]) for k in share}
+    names = [k for k in (rounds[0] if rounds else {}) if k != "reward"]
+    return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in names}
+
+
+def join(parts: list[dict]) -> dict[str, torch.Tensor]:
+    """Episodes of several actors or processes, in order."""
+    parts = [part for part in parts if part]
+    return {k: torch.cat([part[k] for part in parts]) for k in parts[0]}
 
 
 def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
@@ -1477,11 +1480,15 @@ def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path, args: Arg
     agent.load_state_dict(checkpoint["agent"])
 
 
-def name_videos(folder: Path, name: str) -> list[Path]:
-    """RecordEpisode numbers its files; name the new ones after the evaluation that they show."""
-    numbered = sorted(path for path in folder.glob("*.mp4") if path.stem.isdigit())
-    names = [f"{name}.mp4" if len(numbered) == 1 else f"{name}_{i}.mp4" for i in range(len(numbered))]
-    return [path.replace(folder / new) for path, new in zip(numbered, names)]
+def open_metrics(run_dir: Path):
+    """metrics.jsonl, for this process alone to write: two that resume one run would write every row twice."""
+    file = open(run_dir / "metrics.jsonl", "ab")
+    try:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
+    return file
 
 
 def read_metrics(run_dir: Path) -> Iterator[dict]:
@@ -1535,8 +1542,8 @@ def plot_learning_curve(run_dir: Path) -> None:
 
 
 LIMITS = (  # of numbers that are given; none may be infinite or not a number
-    (1, 1e18, "num_envs num_eval_envs num_steps num_minibatches update_epochs num_eval_episodes num_eval_steps "
-              "total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+    (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
+              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
     (0, 1e18, "seed critic_learning_rate ent_coef vf_coef target_kl eval_freq eval_seed reconfiguration_freq "
               "eval_reconfiguration_freq"),
@@ -1553,6 +1560,12 @@ def check(args: Args) -> None:
                 fail(f"--{flag} {getattr(args, flag)}: must lie between {low:g} and {high:g}")
     if args.num_envs % WORLD_SIZE:
         fail(f"--num_envs {args.num_envs} cannot be shared out equally among {WORLD_SIZE} processes")
+    if args.num_actors > args.num_envs:
+        fail(f"--num_actors {args.num_actors}: there are {args.num_envs} environments (--num_envs) to share out")
+    if args.num_actors > WORLD_SIZE and args.sim_backend.startswith("physx_cuda"):
+        fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
+    if args.num_actors % WORLD_SIZE:
+        fail(f"--num_actors {args.num_actors} cannot be shared out equally among {WORLD_SIZE} processes")
     if WORLD_SIZE > 1 and args.evaluate:
         fail("--evaluate is for one process: leave out torchrun")
     if args.batch_size < args.num_minibatches * WORLD_SIZE:
@@ -1642,12 +1655,14 @@ def check(args: Args) -> None:
     for asset in assets:
         if not all(map(is_data_source_downloaded, expand_data_group_into_individual_data_source_ids(asset))):
             fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {asset}")
-    if args.reconfiguration_freq and args.partial_reset and on_gpu and not args.evaluate:
-        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
+    if args.reconfiguration_freq and args.partial_reset and args.num_envs > args.num_actors and not args.evaluate:
+        fail("--reconfiguration_freq rebuilds all environments of a batch at once: it needs --no-partial_reset")
 
     # --- the folder ---
     run_dir = find_run_dir(args)
     try:
+        if args.resume and RANK == 0:
+            open_metrics(run_dir).close()
         if not (args.resume or args.evaluate):
             metrics = run_dir / "metrics.jsonl"
             if (run_dir / "last.pt").exists() or metrics.exists() and metrics.stat().st_size > 0:
@@ -1715,17 +1730,23 @@ def prepare_rendering(args: Args) -> None:
 
 def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
-    run_dir, device = find_run_dir(args), choose_device(args)
+    run_dir = find_run_dir(args)
     prepare_rendering(args)
     torch.set_num_threads(1)
-    envs = make_envs(args, run_dir / "test_videos", evaluation=True)
-    closing.callback(envs.close)
-    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    actors = Actors(args, run_dir / "test_videos")
+    closing.callback(actors.close)
+    envs = actors.local.eval_envs
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(envs.device)
     load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
+    actors.connect(agent)
     num_episodes, num_steps = evaluation_size(envs, args)
-    episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
-    envs.close()  # which completes the videos
-    videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
+    episodes = join(actors.call("evaluate", num_episodes, args.eval_seed, num_steps, rebuilding(args)))
+    film = Film(args, run_dir / "test_videos")
+    closing.callback(film.close)
+    for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs) if args.capture_video else ():
+        film.record(agent, f"seed_{seed}", num_steps, seed)
+    actors.close()  # which completes the trajectories
+    videos = sorted((run_dir / "test_videos").glob("seed_*.mp4"))
 
     results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
     print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {args.eval_seed} on, 95% intervals:")
@@ -1736,6 +1757,46 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     (run_dir / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
     print(f"written: {', '.join(map(str, [run_dir / 'eval.json', *videos]))}")
     return 0
+
+
+@torch.no_grad()
+def rollout(agent, envs, storage: dict, obs, args: Args, sample_action):
+    """Act for num_steps in every environment of one actor, and write what happens into its columns of the storage.
+
+    Args:
+        storage: obs, actions, logprobs, rewards, dones, values and next_values, (num_steps, num_envs, ...) each;
+            next_values[t] is the value of the true next observation of step t (of the final one where the episode
+            ended, or zero where its end is not bootstrapped).
+        obs: (num_envs, obs_dim), the first observation.
+        sample_action: agent.sample_action, or a CUDA graph of it.
+
+    Returns:
+        the next observation, and the sums over the episodes that ended of what is known of each: a dict of scalars."""
+    low, high = action_bounds(envs, envs.device)
+    final_values = torch.zeros_like(storage["next_values"])
+    sums = {"num_episodes": torch.zeros((), device=envs.device)}
+    for step in range(args.num_steps):
+        action, logprob = sample_action(obs)
+        storage["obs"][step], storage["actions"][step], storage["logprobs"][step] = obs, action, logprob
+        # the simulator takes no NaN; the observations keep it, and a check finds it there
+        obs, reward, terminated, truncated, infos = envs.step(action.clamp(low, high).nan_to_num())
+        done = terminated | truncated
+        storage["rewards"][step] = reward * args.reward_scale
+        storage["dones"][step] = done
+        if "final_observation" in infos:  # some episodes ended, and obs is the first of the next ones there
+            counts = bootstraps(args.bootstrap_at_done, terminated, truncated)
+            final_values[step] = torch.where(counts, agent.get_value(infos["final_observation"]), 0.0)
+            final_infos = {"num_episodes": torch.ones_like(reward), **infos["final_info"]["episode"]}
+            for key, value in infos["final_info"].items():  # a task's own numbers, such as is_grasped
+                if isinstance(value, torch.Tensor) and value.shape == done.shape:
+                    final_infos[f"final_{key}"] = value
+            for key, value in final_infos.items():
+                sums[key] = sums.get(key, 0.0) + torch.where(done, value.float(), 0.0).sum()
+    for step in range(args.num_steps):  # no step had to wait for them
+        storage["values"][step] = agent.get_value(storage["obs"][step])
+    following = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
+    storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following))
+    return obs, sums
 
 
 def train(args: Args, closing: contextlib.ExitStack) -> int:
@@ -1772,10 +1833,14 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
 
-    envs = make_envs(share, run_dir / "train_videos")
-    closing.callback(envs.close)
+    actors = Actors(share, run_dir / "videos")
+    closing.callback(actors.close)
+    envs = actors.local.envs
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    low, high = action_bounds(envs, device)
+    ends_early = share.partial_reset and {"success", "fail"} & envs.reset()[1].keys()
+    if ends_early and not can_reset_some(envs):
+        fail(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives each a "
+             "process of its own; or reset all together: --no-partial_reset")  # fmt: skip
 
     agent = Agent(obs_space, action_space, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
@@ -1797,13 +1862,31 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     if WORLD_SIZE > 1:  # the same weights, whatever each machine made of the seed
         agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
-    if args.compile:
-        agent.sample_action = torch.compile(agent.sample_action, dynamic=False)
-        agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
+    num_eval_episodes, max_eval_steps = evaluation_size(actors.local.eval_envs, share)
 
-    eval_envs = make_envs(share, run_dir / "videos", evaluation=True)
-    closing.callback(eval_envs.close)
-    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, share)
+    # --- storage: where the environments are; on another device the learner has a copy of it, and of the agent ---
+    shape = (args.num_steps, share.num_envs)
+    names = ("logprobs", "rewards", "dones", "values", "next_values")
+    storage = {name: torch.zeros(shape, device=envs.device) for name in names}
+    storage["obs"] = torch.zeros(*shape, *obs_space.shape, device=envs.device)
+    storage["actions"] = torch.zeros(*shape, *action_space.shape, device=envs.device)
+    one_device = envs.device.type == device.type
+    on_device = storage if one_device else {k: v.to(device) for k, v in storage.items()}
+    acting_agent = agent if one_device else copy.deepcopy(agent).to(envs.device)
+    if actors.processes:
+        share_memory(acting_agent, storage)
+    cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
+    sample_action = acting_agent.sample_action
+    if args.compile:
+        sample_action = torch.compile(sample_action, dynamic=False)
+    if one_device:
+        sample_action = cuda_graph(sample_action)
+    actors.connect(acting_agent, storage, sample_action)
+    if args.compile:
+        agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
+    film, train_film = Film(share, run_dir / "videos"), Film(share, run_dir / "train_videos")
+    closing.callback(film.close)
+    closing.callback(train_film.close)
 
     # --- logging ---
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -1824,7 +1907,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             config=about, save_code=True, id=wandb_id, resume="allow",
         ).id  # fmt: skip
         closing.push(lambda error, *_: wandb.finish(exit_code=int(error is not None)))
-    metrics_file, writer = open(run_dir / "metrics.jsonl", "ab"), None
+    metrics_file, writer = open_metrics(run_dir), None
     kept = (run_dir / "metrics.jsonl").read_bytes()[: resumed.get("metrics_size", 0)]  # later steps are done again
     metrics_file.truncate(kept.rfind(b"\n") + 1)
     metrics_file.seek(0, os.SEEK_END)
@@ -1879,38 +1962,18 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     def save(name: str, contents: dict) -> bool:
         return not share.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
 
-    # --- rollout storage ---
-    shape = (args.num_steps, share.num_envs)
-    obs = torch.zeros(*shape, *obs_space.shape, device=device)
-    next_obs = torch.zeros_like(obs[0])
-    actions = torch.zeros(*shape, *action_space.shape, device=device)
-    logprobs, rewards, dones, values, next_values, advantages, returns = torch.zeros(7, *shape, device=device)
-    t = torch.zeros(1, dtype=torch.long, device=device)  # the step of the rollout, where a CUDA graph finds it
+    # --- what the learner makes of it ---
+    advantages, returns = torch.zeros(2, *shape, device=device)
     permutation = torch.zeros(share.batch_size, dtype=torch.long, device=device)
-    batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, returns, values)]  # the same memory
-
-    def observe(new_obs):
-        next_obs.copy_(to_device(new_obs, device))
+    flat = {name: x.flatten(0, 1) for name, x in on_device.items()}  # the same memory
+    b_obs, b_actions, b_logprobs, b_values = [flat[name] for name in ("obs", "actions", "logprobs", "values")]
+    batch = [b_obs, b_actions, b_logprobs, advantages.flatten(), returns.flatten(), b_values]
 
     # --- what needs no look from the host, and is launched as a whole where that is faster ---
-    cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
-
-    @cuda_graph
-    @torch.no_grad()
-    def policy_step():
-        """Into row t of the rollout; returns the actions as the simulator can take them."""
-        action, logprob = agent.sample_action(next_obs)
-        obs[t], actions[t], logprobs[t] = next_obs, action, logprob
-        t.add_(1)
-        return action.clamp(low, high).nan_to_num()  # the simulator takes no NaN; a check finds it in the observations
-
     @cuda_graph
     @torch.no_grad()
     def estimate_advantages():
-        for mb_obs, mb_values in zip(*[x.flatten(0, 1).split(share.minibatch_size) for x in (obs, values)]):
-            mb_values.copy_(agent.get_value(mb_obs))  # for which no step had to wait
-        following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
-        next_values.copy_(torch.where(dones.bool(), next_values, following))
+        rewards, values, next_values, dones = [on_device[k] for k in ("rewards", "values", "next_values", "dones")]
         gae = compute_gae(rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae)
         advantages.copy_(gae[0])
         returns.copy_(gae[1])
@@ -1930,8 +1993,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         nonlocal launch_update_epoch
         launch_update_epoch = None
 
-    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
-    rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
+    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes, and a
+    # batch builds the objects of its task once: to meet others it is rebuilt where that is cheap
+    rebuild = args.sim_backend == "physx_cpu" and (args.exact_resume or varies_objects(find_task(args.env_id)))
 
     # --- how it may end ---
     finished, signalled, stopped_by, failures = False, 0, 0, Counter()
@@ -1971,10 +2035,15 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
         finished = iteration == args.num_iterations and not stopped_by
         if finished or not stopped_by and (iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0):
-            episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
+            if acting_agent is not agent:
+                acting_agent.load_state_dict(agent.state_dict())
+            first = args.eval_seed + RANK * num_eval_episodes
+            episodes = actors.call("evaluate", num_eval_episodes, first, max_eval_steps, rebuilding(args))
+            episodes = join(gather(join(episodes)))
             metrics = {key: value.mean().item() for key, value in episodes.items()}
             attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": len(episodes["return"])})
-            name_videos(run_dir / "videos", f"step_{global_step:09d}")
+            if share.capture_video:
+                film.record(acting_agent, f"step_{global_step:09d}", max_eval_steps, args.eval_seed)
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
             best = score > best_score and all(map(math.isfinite, score))
             bar.write(f"step {global_step:>9,}  evaluation: {', '.join(summary(metrics))}" + "  (best)" * best)
@@ -1986,48 +2055,18 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if finished or stopped_by:
             break
 
-        # --- rollout: num_steps in every environment; its noise follows from seed and iteration alone ---
+        # --- rollout: num_steps in every environment, of all actors at once ---
         start = time.perf_counter()
-        seed_all(args.seed, iteration, *[RANK] * (RANK > 0))
-        if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
-            seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
-            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
-            observe(envs.reset(seed=seeds[RANK * share.num_envs :][: share.num_envs], options=rebuild)[0])
-        t.zero_()
-        episode_sums = {"num_episodes": torch.zeros((), device=device)}
-        for step in range(args.num_steps):
-            action = policy_step().clone()  # a task may keep it
-            new_obs, *results, infos = envs.step(action.to(envs.device))
-            observe(new_obs)
-            reward, terminated, truncated = [to_device(x, device) for x in results]
-            done = terminated | truncated
-            rewards[step] = reward * args.reward_scale
-            dones[step] = done
-            if "final_observation" in infos:  # next_obs is the first of a new episode where done
-                with torch.no_grad():
-                    final_value = agent.get_value(to_device(infos["final_observation"], device))
-                next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
-                final_infos = {"num_episodes": torch.ones_like(reward), **infos["final_info"]["episode"]}
-                for key, value in infos["final_info"].items():  # what the task tells beside, such as is_grasped
-                    if isinstance(value, torch.Tensor) and value.shape == done.shape:
-                        final_infos[f"final_{key}"] = value
-                for key, value in final_infos.items():
-                    total = torch.where(done, to_device(value, device).float(), 0.0).sum()
-                    episode_sums[key] = episode_sums.get(key, 0.0) + total
+        restart = iteration == first_iteration or rebuild and iteration % args.checkpoint_freq == 0
+        if acting_agent is not agent:
+            acting_agent.load_state_dict(agent.state_dict())
+        results = actors.call("rollout", iteration, restart, restart and rebuild)
+        if on_device is not storage:
+            for k, v in storage.items():
+                on_device[k].copy_(v)
         estimate_advantages()
-
-        # --- check: what is not finite must not reach the weights; the host learns of it here, once for all steps ---
-        quantities = {"observation": obs, "reward": rewards, "value": next_values}
-        broken = ~torch.stack([torch.isfinite(x).view(*shape, -1).all(-1).all(0) for x in quantities.values()])
-        problem = None
-        if broken.any():
-            names = [name for name, row in zip(quantities, broken) if row.any()]
-            env_idx = broken.any(0).nonzero().flatten()
-            problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
-            # scenes that are rebuilt now and then are so all at once
-            some = None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
-            observe(envs.reset(options=some)[0])
-        problem = next(filter(None, gather(problem)), None)  # of any process is one of all
+        # numbers that are not finite must not reach the weights; those of any process are those of all
+        problem = next(filter(None, gather(next(filter(None, [p for _, p in results]), None))), None)
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
@@ -2042,9 +2081,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             if args.target_kl is not None and update_metrics[-1][KL] > args.target_kl:  # the host waits, once an epoch
                 break
         if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
-            agent.update_normalization(batch[0])
+            agent.update_normalization(b_obs)
         torch.set_num_threads(1)
-        explained_variance = average(1 - (returns - values).var() / returns.var().clamp(min=1e-8))
+        explained_variance = average(1 - (returns.flatten() - b_values).var() / returns.var().clamp(min=1e-8))
         global_step += args.batch_size
 
         # --- log: here the host waits for the device ---
@@ -2058,8 +2097,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                 load_optimizer(snapshot["optimizer"])
                 launch_update_epoch = cuda_graph(update_epoch)  # the one before knows the optimizer's former tensors
         sums = Counter()
-        for part in gather(dict(zip(episode_sums, torch.stack([*episode_sums.values()]).tolist()))):
-            sums.update(part)
+        of_actors = [dict(zip(x, torch.stack([*x.values()]).tolist())) for x, _ in results]
+        for of_actor in itertools.chain(*gather(of_actors)):
+            sums.update(of_actor)
         num_episodes = sums.pop("num_episodes")
         if num_episodes:
             metrics = {key: total / num_episodes for key, total in sums.items()} | metrics
@@ -2074,7 +2114,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             "rollout_time": rollout_time,
             "update_time": elapsed - rollout_time,
             "memory_mb": psutil.Process().memory_info().rss / 2**20,
-            "workers_memory_mb": workers_memory(envs) + workers_memory(eval_envs),
+            "actors_memory_mb": actors.memory(),
         }
         if device.type == "cuda":
             free, total = torch.cuda.mem_get_info(device)
@@ -2091,6 +2131,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if bar.disable and time.monotonic() - last_line > 10:  # no terminal
             print(f"step {global_step:>9,}  training: {status}", flush=True)
             last_line = time.monotonic()
+
+        if args.save_train_video_freq and share.save_train_video_freq and iteration % args.save_train_video_freq == 0:
+            train_film.record(acting_agent, f"step_{global_step:09d}", max_eval_steps, args.eval_seed, exploring=True)
 
     if not finished:
         return 128 + stopped_by
