@@ -1329,9 +1329,9 @@ def as_cuda_graph(function, enabled: bool):
     by one.
 
     It takes nothing or an observation, never makes the host wait, and finds the tensors that it reads and writes always
-    in the same place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
-    as capturing wants it, and the third looks whether the host waits, in which case it is never captured; the next one
-    captures it, and those after that replay.
+    in the same place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of
+    their own, as capturing wants it, and the third looks whether the host waits, in which case it is never captured;
+    the next one captures it, and those after that replay.
 
     Raises:
         RunError: where the capture fails, after which CUDA's random numbers cannot be used any more."""
