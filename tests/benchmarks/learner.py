@@ -67,8 +67,7 @@ class NoSimulation(gym.Env):
         return self.obs.clone(), self.reward.clone(), self.never.clone(), self.elapsed_steps >= LIMIT, self.info()
 
 
-def make_envs(args, record_dir, evaluation=False):
-    num_envs = args.num_eval_envs if evaluation else args.num_envs
+def make_envs(args, num_envs, seed, evaluation=False, record=None):
     env = NoSimulation(num_envs, ppo.choose_device(args))
     return ppo.ManiSkillVectorEnv(env, auto_reset=not evaluation, record_metrics=True)
 
@@ -77,7 +76,8 @@ def train(flags, warm_up):
     """What a run in this process logged of each iteration after `warm_up` ones: a list of dicts."""
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = ppo.parse_args([*flags.split(), "--exp_name", f"{folder}/x", "--eval_freq", "0", "--num_eval_envs", "1",
-                               "--num_eval_episodes", "1", "--target_kl", "None", "--no-capture_video"])  # fmt: skip
+                               "--num_eval_episodes", "1", "--num_actors", "1", "--target_kl", "None",
+                               "--no-capture_video"])  # fmt: skip
         with contextlib.ExitStack() as closing:
             ppo.train(args, closing)
         return [row for row in ppo.read_metrics(Path(folder) / "x") if row["kind"] == "train"][warm_up:]
@@ -144,7 +144,7 @@ def main():
             for name in variants if repetition % 2 else variants[::-1]:
                 times[name].append(run(f"{flags} {VARIANTS[name]}", 3))
             torch.set_num_threads(1)
-            envs = make_envs(ppo.parse_args(flags.split()), None)
+            envs = make_envs(ppo.parse_args(flags.split()), num_envs, 0)
             envs.reset()
             action = torch.zeros(num_envs, ACT, device=device)
             steps_alone.append(

@@ -1,4 +1,4 @@
-"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3 and against simulation alone.
+"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3, and beside other work.
 
     uv run --group benchmark tests/benchmarks/throughput.py
 
@@ -6,16 +6,19 @@ One run alternates between the candidates, several repetitions of each, and prin
 machine drifts: compare ratios, not absolute figures. Both learners have the same networks (3 x 256, tanh, one for
 policy and one for value), minibatch size, epochs and batch, and no target KL that would end an update early:
 
-  ppo.py            16 environments in as many worker processes as there are cores
+  ppo.py            32 environments, in batches of one process for each core
   SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
-  simulation alone  ppo.py's worker pool driven by random actions as noisy as an untrained policy's: no learner
+  ppo.py, loaded    ppo.py while two other processes do nothing but count
 """
 
 import argparse
+import json
 import os
 import platform
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -23,36 +26,31 @@ import gymnasium as gym
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from learner import train
-
 import ppo
 
 BATCH, MINIBATCHES, EPOCHS = 1600, 8, 8
+SCRIPT = Path(ppo.__file__)
 
 
 def ours(iterations):
-    """ppo.py as it is. Returns for each iteration: steps a second, and steps a second of the rollout phase."""
-    flags = (f"--no-cuda --num_envs 16 --num_steps {BATCH // 16} --num_minibatches {MINIBATCHES} "
-             f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations}")  # fmt: skip
-    rows = train(flags, warm_up=1)
-    return [row["sps"] for row in rows], [BATCH / row["rollout_time"] for row in rows]
+    """ppo.py as a command. Returns for each iteration its steps a second."""
+    flags = (f"--no-cuda --num_envs 32 --num_steps {BATCH // 32} --num_minibatches {MINIBATCHES} --target_kl None "
+             f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations} --eval_freq 0 --num_eval_episodes 2 "
+             "--num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(SCRIPT), *flags.split()]
+        subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+        rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]
+    return [row["sps"] for row in rows if row["kind"] == "train"][1:]
 
 
-def simulation_alone(iterations):
-    """The same pool under random actions, with no learner beside it."""
-    args = ppo.parse_args(["--no-cuda", "--num_envs", "16", "--no-capture_video"])
-    envs = ppo.make_envs(args, Path("unused"))
-    envs.reset(seed=list(range(16)))
-    torch.set_num_threads(1)
-    actions = (0.6 * torch.randn(100, *envs.action_space.shape)).clamp(-1, 1)
-    rates = []
-    for _ in range(iterations):
-        start = time.perf_counter()
-        for action in actions:
-            envs.step(action)
-        rates.append(BATCH / (time.perf_counter() - start))
-    envs.close()
-    return rates[1:]
+def ours_beside_other_work(iterations):
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        return ours(iterations)
+    finally:
+        for process in others:
+            process.kill()
 
 
 def sb3_env():
@@ -93,21 +91,21 @@ def stable_baselines3(iterations):
     return [BATCH / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
 
 
+CANDIDATES = {"ppo.py": ours, "SB3": stable_baselines3, "ppo.py, loaded": ours_beside_other_work}
+
+
 def compare(options):
-    rates = {"simulation alone": [], "ppo.py": [], "ppo.py, rollout phase": [], "SB3": []}
+    rates = {name: [] for name in CANDIDATES}
     for _ in range(options.repetitions):
-        rates["simulation alone"].append(statistics.median(simulation_alone(options.iterations)))
-        whole, rollout = ours(options.iterations)
-        rates["ppo.py"].append(statistics.median(whole))
-        rates["ppo.py, rollout phase"].append(statistics.median(rollout))
-        rates["SB3"].append(statistics.median(stable_baselines3(options.iterations)))
+        for name, candidate in CANDIDATES.items():
+            rates[name].append(statistics.median(candidate(options.iterations)))
 
     print(f"\nPushCube-v1, {ppo.num_cores()} cores of {platform.processor() or platform.machine()}, "
           f"torch {torch.__version__}; steps/s, median (min to max) of {options.repetitions} repetitions")  # fmt: skip
     for name, values in rates.items():
         print(f"  {name:<24}{statistics.median(values):8,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
     print("ratios, repetition by repetition")
-    for a, b in (("ppo.py", "SB3"), ("ppo.py, rollout phase", "simulation alone"), ("ppo.py", "simulation alone")):
+    for a, b in (("ppo.py", "SB3"), ("ppo.py, loaded", "ppo.py")):
         ratios = [x / y for x, y in zip(rates[a], rates[b])]
         print(f"  {a + ' / ' + b:<44}{statistics.median(ratios):6.2f}   ({min(ratios):.2f} to {max(ratios):.2f})")
 

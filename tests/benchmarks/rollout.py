@@ -1,0 +1,175 @@
+"""How fast the CPU simulates: a batch against ManiSkill's single environment, and the rollout phase of training against
+physics alone and against another version of the scripts.
+
+    uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt
+    uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt --base ../other-worktree
+
+The candidates take turns, several repetitions of each, since a shared machine drifts: compare ratios.
+
+  single, batch    one process, random actions, one environment and 16
+  rollout phase    of ppo.py with the trained policy, on all cores, as ppo.py itself logs it
+  base             the same of the ppo.py in the folder --base
+  physics alone    on all cores at once: what those rollouts told the physics systems is told them again, from the same
+                   states, and nothing but their step() is timed
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import ppo
+
+# isort: split
+import gymnasium as gym
+import torch
+import torch.multiprocessing as mp
+
+
+def random_actions(env_id, num_envs, steps):
+    """Steps a second of one process."""
+    torch.set_num_threads(1)
+    env = gym.make(env_id, num_envs=num_envs, obs_mode="state", sim_backend="physx_cpu", render_backend="none")
+    env.reset(seed=0)
+    shape = (num_envs, *env.unwrapped.single_action_space.shape)
+    actions = 2 * torch.rand(steps + 5, *shape) - 1
+    for action in actions[:5]:
+        env.step(action)
+    start = time.perf_counter()
+    for action in actions[5:]:
+        env.step(action)
+    rate = steps * num_envs / (time.perf_counter() - start)
+    env.close()
+    return rate
+
+
+def rollout_phase(script, checkpoint, iterations):
+    """Median steps a second of the rollout phase of training that leaves the policy as it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        steps = 1600 * iterations
+        flags = (f"--no-cuda --no-capture_video --exp_name x --eval_freq 0 --num_eval_episodes 2 --num_eval_envs 2 "
+                 f"--total_timesteps {steps} --learning_rate 1e-12 --update_epochs 1")  # fmt: skip
+        command = [sys.executable, str(script), *flags.split(), "--checkpoint", str(checkpoint)]
+        subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+        rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]
+    rates = [1600 / row["rollout_time"] for row in rows if row["kind"] == "train"]
+    return statistics.median(rates[2:])
+
+
+class Recorder:
+    """Notes what a batch's physics systems are told, step by step, and tells them again."""
+
+    def __init__(self, px):
+        self.px, self.log, self.step, self.known = px, [], px.step, None
+        px.step = self.note
+
+    def note(self):
+        states = [system.pack() for system in self.px.systems]
+        known = self.known or [None] * len(states)
+        started = [(i, state) for i, state in enumerate(states) if state != known[i]]  # episodes that were reset
+        self.step()
+        self.log.append((started, self.px.cuda_articulation_target_qpos.data.clone()))
+        self.known = [system.pack() for system in self.px.systems]
+
+    def replay(self):
+        """Seconds in step() alone."""
+        seconds, applied, systems = 0.0, None, self.px.systems
+        for started, targets in self.log:
+            for i, state in started:
+                systems[i].unpack(state)
+            if applied is None or not torch.equal(targets, applied):
+                for joints, row in zip(self.px.joints, targets.tolist()):
+                    for joint, target in zip(joints, row):
+                        joint.set_drive_target(target)
+                applied = targets
+            start = time.perf_counter()
+            for system in systems:
+                system.step()
+            seconds += time.perf_counter() - start
+        return seconds
+
+
+def physics_alone(index, num_actors, checkpoint, barrier, queue):
+    torch.set_num_threads(1)
+    flags = f"--no-cuda --no-capture_video --num_actors {num_actors} --checkpoint {checkpoint} --exp_name x"
+    args = ppo.parse_args(flags.split())
+    actor = ppo.Actor(args, index)
+    agent = ppo.Agent(actor.envs.single_observation_space, actor.envs.single_action_space, args)
+    agent.load_state_dict(ppo.load_checkpoint(checkpoint)["agent"])
+    shape = (args.num_steps, args.num_envs)
+    storage = {k: torch.zeros(shape) for k in ("logprobs", "rewards", "dones", "values", "next_values")}
+    storage["obs"] = torch.zeros(*shape, *actor.envs.single_observation_space.shape)
+    storage["actions"] = torch.zeros(*shape, *actor.envs.single_action_space.shape)
+    actor.connect(agent, storage)
+    actor.rollout(0, True, False)
+    recorder = Recorder(actor.envs.base_env.scene.px)
+    actor.rollout(1, False, False)
+    recorder.px.step = recorder.step
+    for _ in range(3):
+        barrier.wait()
+        seconds = recorder.replay()
+        barrier.wait()
+    queue.put(args.num_steps * len(actor.env_idx) / seconds)
+    actor.close()
+
+
+def physics_on_all_cores(checkpoint):
+    """Steps a second of all cores together."""
+    context, cores = mp.get_context("spawn"), ppo.num_cores()
+    barrier, queue = context.Barrier(cores), context.Queue()
+    arguments = (cores, checkpoint, barrier, queue)
+    processes = [context.Process(target=physics_alone, args=(i, *arguments)) for i in range(cores)]
+    for process in processes:
+        process.start()
+    rate = sum(queue.get() for _ in processes)
+    for process in processes:
+        process.join()
+    return rate
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=os.path.abspath, required=True)
+    parser.add_argument("--base", type=os.path.abspath)
+    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=12)
+    options = parser.parse_args()
+
+    env_id = ppo.load_checkpoint(options.checkpoint)["args"]["env_id"]
+    script = Path(ppo.__file__)
+    candidates = {
+        "single": lambda: random_actions(env_id, 1, 300),
+        "batch": lambda: random_actions(env_id, 16, 60),
+        "rollout phase": lambda: rollout_phase(script, options.checkpoint, options.iterations),
+        "physics alone": lambda: physics_on_all_cores(options.checkpoint),
+    }
+    if options.base:
+        base = Path(options.base) / "ppo.py"
+        candidates["base"] = lambda: rollout_phase(base, options.checkpoint, options.iterations)
+    rates = {name: [] for name in candidates}
+    for _ in range(options.repetitions):
+        for name, candidate in candidates.items():
+            with contextlib.redirect_stdout(sys.stderr):
+                rates[name].append(candidate())
+
+    print(f"\n{env_id}, {ppo.num_cores()} cores of {platform.processor() or platform.machine()}, torch "
+          f"{torch.__version__}; steps/s, median (min to max) of {options.repetitions} repetitions")  # fmt: skip
+    for name, values in rates.items():
+        print(f"  {name:<32}{statistics.median(values):8,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
+    print("ratios, repetition by repetition")
+    for a, b in (("batch", "single"), ("rollout phase", "base"), ("rollout phase", "physics alone")):
+        if b in rates:
+            ratios = [x / y for x, y in zip(rates[a], rates[b])]
+            print(f"  {a + ' / ' + b:<32}{statistics.median(ratios):8.2f}   ({min(ratios):.2f} to {max(ratios):.2f})")
+
+
+if __name__ == "__main__":
+    main()
