@@ -988,7 +988,9 @@ class Actor:
     def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
         self.args, self.index = args, index
         self.env_idx = part(args.num_envs, index, args.num_actors)
-        num_eval_envs = len(part(args.num_eval_envs, index, args.num_actors)) or 1
+        num_eval_envs = len(part(args.num_eval_envs, index, args.num_actors))
+        if args.num_eval_steps is None:
+            num_eval_envs = min(num_eval_envs, len(part(args.num_eval_episodes, index, args.num_actors)))
         self.envs = None
         if not args.evaluate:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
@@ -997,7 +999,7 @@ class Actor:
         if args.save_trajectory and trajectory_dir:
             record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
         first = RANK * args.num_eval_episodes + part(args.num_eval_episodes, index, args.num_actors).start
-        self.eval_envs = make_envs(args, num_eval_envs, args.eval_seed + first, evaluation=True, record=record)
+        self.eval_envs = make_envs(args, num_eval_envs or 1, args.eval_seed + first, evaluation=True, record=record)
         base_env = self.eval_envs.base_env
         batched = isinstance(base_env, sapien_env.BaseEnv) and is_batch(base_env.scene)
         self.separately = batched and can_reset_some(self.eval_envs)
@@ -1019,12 +1021,14 @@ class Actor:
             with torch.no_grad():
                 self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, args, self.sample_action)
-        quantities = {"observation": "obs", "reward": "rewards", "value": "next_values"}
         shape = self.storage["rewards"].shape
-        finite = torch.stack([self.storage[k].isfinite().view(*shape, -1).all(-1).all(0) for k in quantities.values()])
+        names = {"obs": "observation", "rewards": "reward", "next_values": "value"}
+        derived = ("actions", "logprobs", "values", "dones")  # from the others
+        checked = {names.get(k, k): v for k, v in self.storage.items() if v.is_floating_point() and k not in derived}
+        finite = torch.stack([v.isfinite().view(*shape, -1).all(-1).all(0) for v in checked.values()])
         if finite.all():
             return sums, None
-        names = [name for name, row in zip(quantities, finite) if not row.all()]
+        names = [name for name, row in zip(checked, finite) if not row.all()]
         broken = (~finite.all(0)).nonzero().flatten()
         # scenes that ManiSkill rebuilds now and then are so all at once
         self.obs, _ = self.envs.reset(options=None if args.reconfiguration_freq else dict(env_idx=broken))
@@ -1043,13 +1047,17 @@ class Actor:
                 envs.close()
 
 
-def share_memory(agent: nn.Module, storage: dict) -> None:
-    """Move them to memory that all processes see, or refuse what does not fit there: it would end in a 'Bus error'."""
-    needed = sum(x.numel() * x.element_size() for x in [*agent.state_dict().values(), *storage.values()])
+def check_shared_memory(needed: int) -> None:
+    """Refuse what does not fit into the memory that processes share: it would end in a bare 'Bus error'."""
     free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else math.inf
     if needed > free:
-        fail(f"a rollout needs {needed / 2**20:,.0f} MiB of shared memory, and {free / 2**20:,.0f} are free: give the "
+        fail(f"{needed / 2**20:,.0f} MiB of shared memory are needed, and {free / 2**20:,.0f} are free: give the "
              "container more (--shm-size), or use fewer environments or steps, or --num_actors 1")  # fmt: skip
+
+
+def share_memory(agent: nn.Module, storage: dict) -> None:
+    """Move them to memory that all processes see."""
+    check_shared_memory(sum(x.numel() * x.element_size() for x in [*agent.state_dict().values(), *storage.values()]))
     agent.share_memory()
     for x in storage.values():
         x.share_memory_()
@@ -1126,6 +1134,8 @@ class Actors:
 
     def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
         """Hand the weights and the storage to all, in shared memory where there are others."""
+        if self.processes:
+            share_memory(agent, storage or {})
         self._send("connect", agent, storage)
         self.local.connect(agent, storage, sample_action)
         for i in range(len(self.conns)):
@@ -1809,7 +1819,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir = find_run_dir(args)
-    given = asdict(args)  # before videos are switched off: a resumed run may find the renderer that this one lacks
+    given = asdict(args)  # before it is fitted to this machine: a resumed run may be on another
     device = choose_device(args.share())
     if device.type == "cuda":
         torch.cuda.set_device(device)  # where CUDA graphs are captured
@@ -1875,8 +1885,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     one_device = envs.device.type == device.type
     on_device = storage if one_device else {k: v.to(device) for k, v in storage.items()}
     acting_agent = agent if one_device else copy.deepcopy(agent).to(envs.device)
-    if actors.processes:
-        share_memory(acting_agent, storage)
     cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
     sample_action = acting_agent.sample_action
     if args.compile:
@@ -1968,8 +1976,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     advantages, returns = torch.zeros(2, *shape, device=device)
     permutation = torch.zeros(share.batch_size, dtype=torch.long, device=device)
     flat = {name: x.flatten(0, 1) for name, x in on_device.items()}  # the same memory
-    b_obs, b_actions, b_logprobs, b_values = [flat[name] for name in ("obs", "actions", "logprobs", "values")]
-    batch = [b_obs, b_actions, b_logprobs, advantages.flatten(), returns.flatten(), b_values]
+    b_obs = flat["obs"]
+    b_actions, b_logprobs, b_values = [flat[name] for name in ("actions", "logprobs", "values")]
+    batch = [b_actions, b_logprobs, advantages.flatten(), returns.flatten(), b_values]
 
     # --- what needs no look from the host, and is launched as a whole where that is faster ---
     @cuda_graph
@@ -1985,7 +1994,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         mb_metrics = []
         for mb_inds in permutation.split(share.minibatch_size)[: args.num_minibatches]:
             minibatch = [x[mb_inds] for x in batch]
-            mb_metrics.append(update_minibatch(agent, optimizer, args, *minibatch))
+            mb_metrics.append(update_minibatch(agent, optimizer, args, b_obs[mb_inds], *minibatch))
         return average(torch.stack(mb_metrics).mean(0))
 
     launch_update_epoch = cuda_graph(update_epoch)
