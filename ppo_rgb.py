@@ -32,6 +32,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import io
+import itertools
 import json
 import math
 import os
@@ -39,6 +40,7 @@ import platform
 import random
 import re
 import shlex
+import shutil
 import signal
 import sys
 import tempfile
@@ -50,8 +52,13 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
 from unittest.mock import MagicMock, patch
+
+# Idle OpenMP threads spin, on cores that the simulation or other work needs: let them sleep soon
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "300")
 
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
@@ -59,6 +66,11 @@ warnings.filterwarnings(
     message="Failed to find system libvulkan|CUDA reports that you have|.*Box .*precision|.*capturable=True|"
     "Synchronization debug mode is a prototype",
 )
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None
 
 import gymnasium as gym
 import numpy as np
@@ -70,6 +82,7 @@ import torch.multiprocessing as mp
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
+from sapien import physx
 from torch.distributions import Normal
 from tqdm import tqdm
 
@@ -95,12 +108,17 @@ MAX_FAILURES = 5  # in a row: skipped updates, or files that cannot be written
 
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import parse_camera_configs, update_camera_configs_from_dict
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.structs import Articulation, Pose
+from mani_skill.utils.structs import Link
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -117,27 +135,6 @@ def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
 
 
 sapien_env.parse_sim_and_render_backend = parse_backends_and_find_renderer
-
-# Most of a step of one CPU-simulated environment is ManiSkill's Python, and much of that these two functions, for the
-# copies they make of each number: here are the same numbers with fewer.
-create_pose, set_joint_drive_targets = Pose.create, Articulation.set_joint_drive_targets
-
-
-def create_pose_at_once(pose, device=None) -> Pose:
-    if not (isinstance(pose, list) and isinstance(pose[0], sapien.Pose)):
-        return create_pose(pose, device)
-    return Pose(torch.from_numpy(np.array([np.concatenate((p.p, p.q)) for p in pose])).to(device))
-
-
-def set_joint_drive_targets_at_once(self, targets, joints=None, joint_indices=None) -> None:
-    if self.scene.gpu_sim_enabled or not isinstance(targets, torch.Tensor):
-        return set_joint_drive_targets(self, targets, joints, joint_indices)
-    for joint, target in zip(joints, targets[0].numpy()[:, None]):
-        joint._objs[0].drive_target = target
-
-
-Pose.create = staticmethod(create_pose_at_once)
-Articulation.set_joint_drive_targets = set_joint_drive_targets_at_once
 
 # what concerns no user: the render device is replaced above, robots are as they are
 NOISE = "Requested to use render device|mani_skill is not installed with git|"
@@ -185,21 +182,23 @@ class Args:
     reward_mode: Optional[Literal["normalized_dense", "dense", "sparse", "none"]] = None
     """what is learned from (None: the first of these that the task has)"""
     sim_backend: str = "auto"
-    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu (worker processes), or auto"""
+    """physx_cuda (all environments on one GPU; physx_cuda:1 on the second), physx_cpu, or auto"""
     render_backend: str = "gpu"
     """where images are rendered: gpu (gpu:1) or cpu; what is not there is replaced by what is"""
     num_envs: int = 256
-    """parallel training environments (on a CPU: 8 a core)"""
+    """parallel training environments (on a CPU: 16 a core)"""
     num_eval_envs: int = 16
-    """parallel evaluation environments (on a CPU: 4 a core)"""
+    """parallel evaluation environments (on a CPU: 16 a core)"""
+    num_actors: Optional[int] = None
+    """processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
     """end a training episode at success or failure; --no-partial_reset: at the time limit only"""
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
-    """rebuild training scenes every so many resets (None: the task's own; on a GPU needs --no-partial_reset)"""
+    """rebuild training scenes every so many resets (None: the task's own); a batch needs --no-partial_reset for it"""
     eval_reconfiguration_freq: Optional[int] = None
-    """rebuild evaluation scenes every so many resets; 1 suits tasks that vary their objects"""
+    """rebuild evaluation scenes every so many resets (None: 1 for tasks that vary their objects, else 0: never)"""
     render_mode: Literal["rgb_array", "sensors", "all"] = "all"
     """what videos show: rgb_array (the scene), sensors (what the policy sees) or all (both)"""
     shader: Optional[Literal["minimal", "default", "rt-fast", "rt-med", "rt"]] = None
@@ -291,9 +290,9 @@ class Args:
     capture_video: bool = True
     """film the first episodes of each evaluation, where there is a renderer"""
     save_train_video_freq: Optional[int] = None
-    """film training every so many iterations (on a GPU all environments, as tiles: keep num_envs small)"""
+    """film the policy as it explores in training, every so many iterations"""
     save_trajectory: bool = False
-    """write evaluation episodes as ManiSkill trajectories, beside the videos: one file, or on a CPU one an environment
+    """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor
     (python -m mani_skill.trajectory.merge_trajectory joins them)"""
 
     # --- runtime ---
@@ -322,6 +321,7 @@ class Args:
         return replace(
             self, num_envs=self.num_envs // WORLD_SIZE, num_eval_envs=math.ceil(self.num_eval_envs / WORLD_SIZE),
             num_eval_episodes=math.ceil(self.num_eval_episodes / WORLD_SIZE), sim_backend=backend,
+            num_actors=max(1, self.num_actors // WORLD_SIZE),
             **{} if RANK == 0 else dict(
                 capture_video=False, save_train_video_freq=None, save_trajectory=False, save_model=False, track=False
             ),
@@ -336,7 +336,9 @@ TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3,
 
 # --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
 # of the network from the checkpoint; a resumed run may be given only some anew
-OF_THE_MACHINE = {"cuda", "sim_backend", "render_backend", "num_eval_envs", "capture_video", "save_trajectory", "track"}
+OF_THE_MACHINE = {
+    "cuda", "sim_backend", "render_backend", "num_eval_envs", "num_actors", "capture_video", "save_trajectory", "track"
+}  # fmt: skip
 OF_THE_NETWORK = (
     "norm_obs", "encoder", "obs_mode", "include_state", "frame_stack", "camera_width", "camera_height", "shader",
 )  # fmt: skip
@@ -410,7 +412,7 @@ def parse_args(argv: list[str]) -> Args:
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
         cores = num_cores() * WORLD_SIZE
-        default = replace(default, **CPU_DEFAULTS, num_envs=8 * cores, num_eval_envs=4 * cores)
+        default = replace(default, **CPU_DEFAULTS, num_envs=16 * cores, num_eval_envs=16 * cores)
     if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
@@ -428,6 +430,9 @@ def parse_args(argv: list[str]) -> Args:
         args.resume = str(find_checkpoint(args.resume))
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+    if args.num_actors is None:
+        cores = num_cores() * WORLD_SIZE if args.sim_backend == "physx_cpu" else WORLD_SIZE
+        args.num_actors = max(1, min(cores, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     return args
@@ -465,6 +470,12 @@ def default_reward_mode(task) -> str:
     return next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in task.SUPPORTED_REWARD_MODES)
 
 
+def varies_objects(task) -> bool:
+    """Whether a task builds other objects for each episode of a single environment. ManiSkill's tasks then take
+    reconfiguration_freq, to switch that off for batches."""
+    return "reconfiguration_freq" in inspect.signature(task.cls.__init__).parameters
+
+
 class ImageObservations(FlattenRGBDObservationWrapper):
     """Observations as a dict: if included "state", float32 (num_envs, state_dim), and each texture of `obs_mode`, all
     cameras together as channels: (num_envs, height, width, channels), in the dtype in which it was rendered (uint8
@@ -500,8 +511,8 @@ class ImageObservations(FlattenRGBDObservationWrapper):
 
     def reset(self, *, seed=None, options=None):
         obs, info = self.env.reset(seed=seed, options=options)
-        everyone = torch.arange(self.base_env.num_envs, device=self.base_env.device)
-        return self.observation(obs, (options or {}).get("env_idx", everyone)), info
+        env_idx = (options or {}).get("env_idx", np.arange(self.base_env.num_envs))
+        return self.observation(obs, torch.as_tensor(env_idx, device=self.base_env.device)), info
 
     def render(self) -> torch.Tensor:
         """The scene, what the policy sees, or both, as render_mode asks: uint8 (num_envs, height, width, 3)."""
@@ -536,59 +547,72 @@ def sensor_configs(args: Args) -> dict:
     return {k: v for k, v in flags.items() if v is not None} | json.loads(args.env_kwargs).get("sensor_configs", {})
 
 
-class Recorder(RecordEpisode):
-    def flush_video(self, *args, **kwargs):
-        try:
-            super().flush_video(*args, **kwargs)
-        except OSError as error:  # such as a full disk
-            print(f"a video could not be written, the run goes on: {error}", flush=True)
-            self.render_images, self._video_steps = [], 0
-
-
-def make_env(args: Args, record_dir: Path, evaluation: bool, index: int = 0, num_envs: int = 1) -> gym.Env:
-    """One ManiSkill environment with its wrappers: `num_envs` scenes on a GPU, or a single one on the CPU, where
-    `index` tells it from the others and only the first is filmed."""
-    video = index == 0 and (args.capture_video if evaluation else args.save_train_video_freq is not None)
-    trajectory = evaluation and args.save_trajectory
+def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
+    """`num_envs` environments of the task as one ManiSkill environment: a batch, or on a CPU also a single one."""
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
         control_mode=args.control_mode,
         robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
         reward_mode=args.reward_mode or default_reward_mode(find_task(args.env_id).cls),
-        reconfiguration_freq=args.eval_reconfiguration_freq if evaluation else args.reconfiguration_freq,
+        reconfiguration_freq=0 if evaluation else args.reconfiguration_freq,  # `evaluate` rebuilds its scenes itself
         sim_backend=args.sim_backend,
         render_backend=args.render_backend,
-        render_mode=args.render_mode if video else None,
+        render_mode=args.render_mode if film else None,
     )
     kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
     env = gym.make(args.env_id, **kwargs | {"sensor_configs": sensor_configs(args)})
     env = ImageObservations(env, args)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = FlattenActionSpaceWrapper(env)
-    if video or trajectory:
-        base_env, rounds_filmed = env.unwrapped, 4 if args.evaluate else 1
-
-        def is_filmed(step):
-            if evaluation:  # its first episodes, which the seeds tell
-                return base_env._episode_seed[0] < args.eval_seed + rounds_filmed * args.num_eval_envs
-            return step // args.num_steps % args.save_train_video_freq == 0
-
-        env = Recorder(
-            env,
-            output_dir=str(record_dir),
-            save_video=video,
-            save_video_trigger=is_filmed,
-            save_on_reset=evaluation,
-            avoid_overwriting_video=not evaluation,
-            max_steps_per_video=evaluation_size(env, args)[1] if evaluation else args.num_steps,
-            video_fps=base_env.control_freq,
-            save_trajectory=trajectory,
-            trajectory_name=f"trajectory_{index}",
-            source_type="rl",
-            source_desc="PPO",
-        )
     return env
+
+
+def make_envs(args: Args, num_envs: int, seed: int, evaluation: bool = False, record=None) -> ManiSkillVectorEnv:
+    """Environments with ManiSkill's interface for a batch. Those for evaluation do not reset by themselves: `evaluate`
+    starts each episode from its seed.
+
+    Args:
+        seed: what the objects of a batch are built from, in tasks that vary them.
+        record: arguments of RecordEpisode, to film the environments or to write their trajectories."""
+    sapien_env.BaseEnv.build_seed = seed
+    env = make_env(args, num_envs, evaluation, film=bool(record and record["save_video"]))
+    if record:
+        env = RecordEpisode(env, save_on_reset=True, source_type="rl", source_desc="PPO", **record)
+    return ManiSkillVectorEnv(
+        env,
+        auto_reset=not evaluation,
+        ignore_terminations=not (args.eval_partial_reset if evaluation else args.partial_reset),
+        record_metrics=True,
+    )
+
+
+def rebuilding(args: Args) -> int:
+    """In every how many rounds of an evaluation its scenes are rebuilt."""
+    if args.eval_reconfiguration_freq is not None:
+        return args.eval_reconfiguration_freq
+    return int(varies_objects(find_task(args.env_id)) or args.exact_resume and args.sim_backend == "physx_cpu")
+
+
+def can_reset_some(envs: ManiSkillVectorEnv) -> bool:
+    """Whether the task can reset some of several environments: a few of ManiSkill's fail."""
+    try:
+        envs.reset(options=dict(env_idx=torch.zeros(1, dtype=torch.long, device=envs.device)))
+    except (RuntimeError, IndexError, ValueError, AssertionError):
+        return envs.num_envs == 1
+    return True
+
+
+def start_episodes(envs: ManiSkillVectorEnv, seeds: list[int], separately: bool):
+    """Start an episode from each seed; returns the first observations. ManiSkill draws a batch from its first seed:
+    `separately` resets each environment by itself, so that each episode follows from its own seed alone."""
+    if not separately:
+        return envs.reset(seed=seeds)[0]
+    for i, seed in enumerate(seeds):
+        obs, _ = envs.reset(seed=[seed] * len(seeds), options=dict(env_idx=torch.tensor([i])))
+    envs.base_env._set_main_rng(seeds)
+    envs.base_env._set_episode_rng(seeds, torch.arange(len(seeds)))  # for what a task draws during its episodes
+    return obs
 
 
 def evaluation_size(env: gym.Env, args: Args) -> tuple[int, int]:
@@ -607,257 +631,603 @@ def seed_all(*numbers: int) -> None:
     torch.manual_seed(seed)
 
 
-def stream_seed(seed: int) -> int:
-    """Seed of the random stream from which episodes without a seed follow one with `seed`. ManiSkill draws that one
-    from `seed` itself, so the others need a different one; like all seeds of training it is at least 2^31."""
-    return int(np.random.SeedSequence(seed).generate_state(1)[0]) | 2**31
-
-
 def as_dict(obs) -> dict:
     """Observations by name, also where there is one only."""
     return obs if isinstance(obs, (dict, gym.spaces.Dict)) else {"state": obs}
 
 
-def cpu_worker(conn, make_env, indices, auto_reset, ignore_terminations) -> None:
-    """Body of a worker process: build the environments `indices`, then answer each message with one message.
+class Film:
+    """A small batch of its own that is rendered: it plays the first evaluation episodes again, into videos."""
 
-    Each environment has its own stream of torch random numbers, so that its episodes depend on neither its neighbours
-    nor the number of workers."""
+    def __init__(self, args: Args, folder: Path):
+        self.args, self.folder, self.envs = args, folder, None
+        self.num_envs = 1 if args.sim_backend == "physx_cpu" else 4
+
+    def record(self, agent, name: str, num_steps: int, seed: int, exploring: bool = False) -> None:
+        """Write episodes that start from `seed` on as <folder>/<name>.mp4."""
+        if self.envs is None:
+            video = dict(output_dir=str(self.folder), save_video=True, save_trajectory=False, max_steps_per_video=10**9)
+            self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, record=video)
+            self.envs._env.video_fps = self.envs.base_env.control_freq
+        evaluate(agent, self.envs, self.num_envs, seed, num_steps, rebuilding(self.args), exploring=exploring)
+        try:
+            self.envs._env.flush_video(name=name)
+        except OSError as error:  # such as a full disk
+            print(f"a video could not be written, the run goes on: {error}", flush=True)
+            self.envs._env.render_images, self.envs._env._video_steps = [], 0
+
+    def close(self) -> None:
+        if self.envs is not None:
+            self.envs.close()
+
+
+# ----- Batched CPU simulation -----------------------------------------------------------------------------------------
+
+
+class Array:
+    """What SAPIEN's CUDA arrays are to ManiSkill: something with .torch(). `refresh` fills an outdated one."""
+
+    def __init__(self, *shape: int, refresh=None):
+        self.data = torch.zeros(shape)
+        self.applied = torch.zeros(shape)  # what the simulation has of it
+        self.refresh, self.outdated = refresh, False
+
+    def fetch(self, rows, columns, values: torch.Tensor) -> None:
+        self.data[rows, columns] = values
+        self.applied[rows, columns] = values
+
+    def changes(self, rows=slice(None), columns=slice(None)) -> torch.Tensor:
+        """Where the tensor was written since it was fetched or applied: bool, of these rows and columns. What was not
+        written is left alone in the simulation, to the last bit."""
+        changed = self.data[rows, columns] != self.applied[rows, columns]
+        if changed.any():
+            self.applied[rows, columns] = self.data[rows, columns]
+        return changed
+
+    def torch(self):
+        if self.outdated:
+            self.outdated = False
+            self.refresh()
+        return self.data
+
+
+class BatchedPhysx:
+    """One PhysxCpuSystem per environment behind the interface of SAPIEN's PhysxGpuSystem, with tensors on the CPU.
+
+    ManiSkill simulates a batch of environments through the tensors `cuda_*` of that interface: `gpu_apply_*` moves what
+    was written into the simulation, `gpu_fetch_*` moves what was simulated into the tensors. Each body has a row in
+    `cuda_rigid_body_data` (position, quaternion, linear and angular velocity: 13 numbers), first all free bodies, then
+    all links; each articulation has one in `cuda_articulation_*`, padded to the largest number of joints."""
+
+    __class__ = physx.PhysxGpuSystem  # so says isinstance
+
+    def __init__(self, scenes: list[sapien.Scene]):
+        self.scenes, self.systems = scenes, [scene.physx_system for scene in scenes]
+        for scene in scenes:
+            scene.batch = self
+
+    @property
+    def timestep(self) -> float:
+        return self.systems[0].timestep
+
+    @timestep.setter
+    def timestep(self, value: float):
+        for system in self.systems:
+            system.timestep = value
+
+    def gpu_init(self) -> None:
+        self.free = [body for system in self.systems for body in system.rigid_dynamic_components]
+        self.links = [link for system in self.systems for link in system.articulation_link_components]
+        self.articulations = [link.articulation for link in self.links if link.is_root]
+        self.joints = [articulation.active_joints for articulation in self.articulations]
+        self.row = {body: i for i, body in enumerate(self.free + self.links)}
+        self.articulation_row = {articulation: i for i, articulation in enumerate(self.articulations)}
+        self.root_rows = torch.tensor([self.row[link] for link in self.links if link.is_root], dtype=torch.long)
+        num_bodies, num_articulations = len(self.row), len(self.articulations)
+        max_dof = max([articulation.dof for articulation in self.articulations], default=0)
+        max_links = max([len(articulation.links) for articulation in self.articulations], default=0)
+        self.cuda_rigid_body_data = Array(num_bodies, 13)
+        self.cuda_rigid_body_force, self.cuda_rigid_body_torque = Array(num_bodies, 4), Array(num_bodies, 4)
+        for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel"):
+            setattr(self, f"cuda_articulation_{name}", Array(num_articulations, max_dof))
+        self.cuda_articulation_qacc = Array(num_articulations, max_dof, refresh=self._read_qacc)
+        self.cuda_articulation_link_incoming_joint_forces = Array(num_articulations, max_links, 6)
+
+        # Where the numbers stand in what pack() returns: for each free body, then each articulation of a scene, the
+        # quaternion (w first), position, linear and angular velocity; for articulations also positions, velocities and
+        # both kinds of drive targets of their joints.
+        free_at, roots_at, joints_at, end = [], [], [], 0
+        for system in self.systems:
+            for _ in system.rigid_dynamic_components:
+                free_at.append(end)
+                end += 13
+            for link in system.articulation_link_components:
+                if link.is_root:
+                    roots_at.append(end)
+                    joints_at.append(end + 13)
+                    end += 13 + 4 * link.articulation.dof
+        state = torch.tensor([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
+        self.free_columns = torch.tensor(free_at, dtype=torch.long)[:, None] + state
+        self.root_columns = torch.tensor(roots_at, dtype=torch.long)[:, None] + state[7:]
+        self.joint_columns = torch.full((2, num_articulations, max_dof), end)  # for padding: a zero at the end
+        for i, articulation in enumerate(self.articulations):
+            positions = joints_at[i] + torch.arange(articulation.dof)
+            self.joint_columns[0, i, : articulation.dof] = positions
+            self.joint_columns[1, i, : articulation.dof] = positions + articulation.dof
+        self.num_packed_poses, self.moved = None, True
+        self.gpu_fetch_rigid_dynamic_data()
+        self.gpu_fetch_articulation_link_pose()
+        self.gpu_fetch_articulation_qpos()
+        self.gpu_fetch_articulation_qvel()
+
+    def step(self) -> None:
+        self.gpu_apply_articulation_target_position()
+        self.gpu_apply_articulation_target_velocity()
+        for system in self.systems:
+            system.step()
+        self.moved = True
+
+    # --- from the simulation to the tensors ---
+
+    def _pack(self) -> None:
+        """Read the whole state of all scenes, unless nothing has moved since."""
+        if not self.moved:
+            return
+        self.moved, self.contacts = False, None
+        self.cuda_articulation_qacc.outdated = True
+        packed = bytearray().join([*(system.pack() for system in self.systems), bytes(4)])
+        self.packed = torch.frombuffer(packed, dtype=torch.float32)
+        packed_poses = [scene.pack_poses() for scene in self.scenes]
+        if sum(map(len, packed_poses)) != self.num_packed_poses:  # lights and cameras may be added at any time
+            self._find_links([len(poses) // 4 for poses in packed_poses])
+            self.num_packed_poses = sum(map(len, packed_poses))
+        if self.links:
+            self.packed_poses = torch.frombuffer(bytearray().join(packed_poses), dtype=torch.float32)
+
+    def _find_links(self, sizes: list[int]) -> None:
+        """Where each link's pose stands in what pack_poses() returns: quaternion and position of each entity."""
+        starts = np.cumsum([0, *sizes])
+        entity_at = {}
+        for scene, start in zip(self.scenes, starts):
+            entity_at |= {entity: start + 7 * i for i, entity in enumerate(scene.entities)}
+        links_at = torch.tensor([int(entity_at[link.entity]) for link in self.links], dtype=torch.long)
+        self.link_columns = links_at[:, None] + torch.tensor([4, 5, 6, 0, 1, 2, 3])
+
+    def gpu_fetch_rigid_dynamic_data(self) -> None:
+        self._pack()
+        self.cuda_rigid_body_data.fetch(slice(0, len(self.free)), slice(None), self.packed[self.free_columns])
+
+    def gpu_fetch_articulation_link_pose(self) -> None:
+        self._pack()
+        if self.links:
+            poses = self.packed_poses[self.link_columns]
+            self.cuda_rigid_body_data.fetch(slice(len(self.free), None), slice(0, 7), poses)
+
+    def gpu_fetch_articulation_link_velocity(self) -> None:
+        """Of the roots; `read_velocities` gets those of other links, for which few tasks ask."""
+        self._pack()
+        self.cuda_rigid_body_data.fetch(self.root_rows, slice(7, 13), self.packed[self.root_columns])
+
+    def read_velocities(self, links: list) -> None:
+        rows = [self.row[link] for link in links if not link.is_root]
+        if rows:
+            velocities = np.array([[*link.linear_velocity, *link.angular_velocity] for link in links])
+            self.cuda_rigid_body_data.data[rows, 7:] = torch.from_numpy(velocities).float()
+
+    def gpu_fetch_articulation_qpos(self) -> None:
+        self._pack()
+        self.cuda_articulation_qpos.fetch(slice(None), slice(None), self.packed[self.joint_columns[0]])
+
+    def gpu_fetch_articulation_qvel(self) -> None:
+        self._pack()
+        self.cuda_articulation_qvel.fetch(slice(None), slice(None), self.packed[self.joint_columns[1]])
+
+    def _read_qacc(self) -> None:
+        for articulation, row in zip(self.articulations, self.cuda_articulation_qacc.data):
+            row[: articulation.dof] = torch.from_numpy(articulation.qacc)
+
+    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
+        for articulation, row in zip(self.articulations, self.cuda_articulation_link_incoming_joint_forces.data):
+            row[: len(articulation.links)] = torch.from_numpy(articulation.get_link_incoming_joint_forces())
+
+    # --- from the tensors to the simulation ---
+
+    def gpu_apply_rigid_dynamic_data(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(slice(0, len(self.free)))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            body, row = self.free[i], self.cuda_rigid_body_data.data[i].numpy()
+            if changed[i, :7].any():
+                body.pose = sapien.Pose(row[:3], row[3:7])
+            if not body.kinematic and changed[i, 7:].any():
+                body.linear_velocity, body.angular_velocity = row[7:10], row[10:13]
+            self.moved = True
+
+    def gpu_apply_articulation_root_pose(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(0, 7))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
+            self.articulations[i].root_pose = sapien.Pose(row[:3], row[3:7])
+            self.moved = True
+
+    def gpu_apply_articulation_root_velocity(self) -> None:
+        changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(7, 13))
+        for i in changed.any(dim=1).nonzero().flatten().tolist():
+            row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
+            self.articulations[i].root_linear_velocity = row[7:10]
+            self.articulations[i].root_angular_velocity = row[10:13]
+            self.moved = True
+
+    def _apply(self, name: str) -> None:
+        array = getattr(self, f"cuda_articulation_{name}")
+        for i in array.changes().any(dim=1).nonzero().flatten().tolist():
+            setattr(self.articulations[i], name, array.data[i, : self.articulations[i].dof].numpy())
+            self.moved = True
+
+    def gpu_apply_articulation_qpos(self) -> None:
+        self._apply("qpos")
+
+    def gpu_apply_articulation_qvel(self) -> None:
+        self._apply("qvel")
+
+    def gpu_apply_articulation_qf(self) -> None:
+        self._apply("qf")
+
+    def _apply_targets(self, name: str, set_target) -> None:
+        array = getattr(self, f"cuda_articulation_{name}")
+        changed = array.changes()
+        if changed.any():
+            targets = array.data.tolist()
+            for i, j in changed.nonzero().tolist():
+                set_target(self.joints[i][j], targets[i][j])
+
+    def gpu_apply_articulation_target_position(self) -> None:
+        self._apply_targets("target_qpos", physx.PhysxArticulationJoint.set_drive_target)
+
+    def gpu_apply_articulation_target_velocity(self) -> None:
+        self._apply_targets("target_qvel", physx.PhysxArticulationJoint.set_drive_velocity_target)
+
+    def gpu_apply_rigid_dynamic_force(self) -> None:
+        """Forces act once, at the centre of mass."""
+        forces = self.cuda_rigid_body_force.data
+        for body, i in self.row.items():
+            if forces[i].any():
+                body.add_force_at_point(forces[i, :3].numpy(), (body.pose * body.cmass_local_pose).p)
+        forces.zero_()
+
+    def gpu_apply_rigid_dynamic_torque(self) -> None:
+        torques = self.cuda_rigid_body_torque.data
+        for body, i in self.row.items():
+            if torques[i].any():
+                body.add_force_torque(np.zeros(3, np.float32), torques[i, :3].numpy())
+        torques.zero_()
+
+    # --- contacts: asked of the simulation only where a task asks ---
+
+    def get_contacts(self) -> list:
+        if self.contacts is None:
+            self.contacts = [contact for system in self.systems for contact in system.get_contacts()]
+        return self.contacts
+
+    def gpu_create_contact_pair_impulse_query(self, pairs: list[tuple]):
+        return SimpleNamespace(rows={pair: i for i, pair in enumerate(pairs)}, cuda_impulses=Array(len(pairs), 3))
+
+    def gpu_query_contact_pair_impulses(self, query) -> None:
+        """Impulse on the first body of each pair from the second."""
+        impulses = query.cuda_impulses.data.zero_()
+        for contact in self.get_contacts():
+            first, second = contact.bodies
+            if (first, second) in query.rows:
+                impulses[query.rows[first, second]] += total_impulse(contact)
+            elif (second, first) in query.rows:
+                impulses[query.rows[second, first]] -= total_impulse(contact)
+
+    def gpu_create_contact_body_impulse_query(self, bodies: list):
+        return SimpleNamespace(rows={body: i for i, body in enumerate(bodies)}, cuda_impulses=Array(len(bodies), 3))
+
+    def gpu_query_contact_body_impulses(self, query) -> None:
+        impulses = query.cuda_impulses.data.zero_()
+        for contact in self.get_contacts():
+            for body, sign in zip(contact.bodies, (1, -1)):
+                if body in query.rows:
+                    impulses[query.rows[body]] += sign * total_impulse(contact)
+
+    # --- what a CPU simulation need not do ---
+
+    def get_scene_offset(self, scene) -> list[float]:
+        return [0.0, 0.0, 0.0]  # each scene is a world of its own
+
+    def _nothing(self) -> None:
+        pass
+
+    gpu_fetch_articulation_qacc = gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
+    gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
+
+
+def total_impulse(contact) -> torch.Tensor:
+    return torch.from_numpy(np.sum([point.impulse for point in contact.points], axis=0, dtype=np.float32))
+
+
+class BatchedRenderer:
+    """Stands for SAPIEN's RenderSystemGroup: the cameras of all scenes, one after the other, on any Vulkan device."""
+
+    def __init__(self, scenes: list[sapien.Scene]):
+        self.scenes = scenes
+
+    def update_render(self) -> None:
+        for scene in self.scenes:
+            scene.update_render()
+
+    def create_camera_group(self, cameras: list, names: list[str]):
+        return BatchedCamera(cameras)
+
+
+class BatchedCamera:
+    def __init__(self, cameras: list):
+        self.cameras = cameras
+
+    def take_picture(self) -> None:
+        for camera in self.cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> SimpleNamespace:
+        pictures = torch.from_numpy(np.stack([camera.get_picture(name) for camera in self.cameras]))
+        return SimpleNamespace(torch=lambda: pictures)
+
+
+def is_batch(scene: ManiSkillScene) -> bool:
+    return type(scene.px) is BatchedPhysx
+
+
+def batch_on_cpu() -> None:
+    """Let gym.make(task, num_envs=N, sim_backend="physx_cpu") build a batch, with the contract of physx_cuda. What
+    ManiSkill does with one environment, or on a GPU, stays as it is."""
+    setup_scene, reset = sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset
+    body_data = PhysxRigidBodyComponentStruct._body_data
+    set_action, compute_ik = PDEEPosController.set_action, Kinematics.compute_ik
+
+    def setup_batch(env):
+        if env.num_envs == 1 or env._sim_device.is_cuda():
+            return setup_scene(env)
+        env._set_scene_config()
+        rendered = can_render(env._render_device)
+        scenes = []
+        for _ in range(env.num_envs):
+            renderer = [sapien.render.RenderSystem(env._render_device)] if rendered else []
+            scenes.append(sapien.Scene([physx.PhysxCpuSystem(), *renderer]))
+        env.scene = ManiSkillScene(scenes, sim_config=env.sim_config, device=env.device, backend=env.backend)
+        env.scene.px, env.scene.gpu_sim_enabled = BatchedPhysx(scenes), True
+        env.scene.render_system_group = BatchedRenderer(scenes)
+        env.scene.px.timestep = 1 / env._sim_freq
+
+    def reset_from_own_seeds(env, seed=None, options=None):
+        if env._last_obs is None and env.num_envs > 1:  # it is being made
+            seed = [env.build_seed + i for i in range(env.num_envs)]
+        return reset(env, seed=seed, options=options)
+
+    def body_data_with_velocities(struct):
+        if isinstance(struct, Link) and is_batch(struct.scene):
+            struct.px.read_velocities(struct._objs)
+        return body_data.fget(struct)
+
+    def set_action_by_pose(controller, action):
+        """The solver for one environment wants a pose to reach, not a change of pose."""
+        scene = controller.scene
+        if is_batch(scene):
+            controller.scene = SimpleNamespace(gpu_sim_enabled=False, num_envs=scene.num_envs)
+        try:
+            set_action(controller, action)
+        finally:
+            controller.scene = scene
+
+    def compute_ik_by_row(kinematics, pose, q0, **kwargs):
+        if kinematics.use_gpu_ik or len(q0) == 1:
+            return compute_ik(kinematics, pose, q0, **kwargs)
+        controlled = kinematics.active_joint_indices
+        solutions = [compute_ik(kinematics, pose[i : i + 1], q0[i : i + 1]) for i in range(len(q0))]
+        return torch.cat([q0[i, controlled][None] if x is None else x for i, x in enumerate(solutions)])
+
+    def row_of(cls, name, table, scene_of):
+        """ManiSkill asks bodies and articulations for their rows in the tensors."""
+        index = getattr(cls, name)
+
+        def find(component):
+            batch = getattr(scene_of(component), "batch", None)
+            return getattr(batch, table)[component] if batch else index.fget(component)
+
+        setattr(cls, name, property(find))
+
+    row_of(physx.PhysxRigidDynamicComponent, "gpu_pose_index", "row", lambda body: body.entity.scene)
+    row_of(physx.PhysxArticulationLinkComponent, "gpu_pose_index", "row", lambda link: link.entity.scene)
+    row_of(physx.PhysxArticulation, "gpu_index", "articulation_row", lambda robot: robot.root.entity.scene)
+    sapien_env.CPU_SIM_BACKENDS = set()  # for which ManiSkill refuses more than one environment
+    sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset = setup_batch, reset_from_own_seeds
+    sapien_env.BaseEnv.build_seed = 2022  # ManiSkill's; a run sets its own, so that its processes build other objects
+    PhysxRigidBodyComponentStruct._body_data = property(body_data_with_velocities)
+    PDEEPosController.set_action, Kinematics.compute_ik = set_action_by_pose, compute_ik_by_row
+
+
+batch_on_cpu()
+
+
+# ----- Actors ---------------------------------------------------------------------------------------------------------
+
+
+def part(total: int, index: int, parts: int) -> range:
+    """What falls to one of several when `total` things are shared out."""
+    return range(total * index // parts, total * (index + 1) // parts)
+
+
+class Actor:
+    """The environments of one process: their part of training, and their part of each evaluation.
+
+    Raises SystemExit, with one line, if the task cannot do what is asked of it."""
+
+    def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
+        self.args, self.index = args, index
+        self.env_idx = part(args.num_envs, index, args.num_actors)
+        num_eval_envs = len(part(args.num_eval_envs, index, args.num_actors))
+        if args.num_eval_steps is None:
+            num_eval_envs = min(num_eval_envs, len(part(args.num_eval_episodes, index, args.num_actors)))
+        self.envs = None
+        if not args.evaluate:
+            seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
+            self.envs = make_envs(args, len(self.env_idx), seed)
+        record = None
+        if args.save_trajectory and trajectory_dir:
+            record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
+        first = RANK * args.num_eval_episodes + part(args.num_eval_episodes, index, args.num_actors).start
+        self.eval_envs = make_envs(args, num_eval_envs or 1, args.eval_seed + first, evaluation=True, record=record)
+        self.separately = args.sim_backend == "physx_cpu" and can_reset_some(self.eval_envs)
+
+    def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
+        """What to act with, and what to write into: this actor's columns."""
+        columns = slice(self.env_idx.start, self.env_idx.stop)
+        self.agent, self.storage = agent, storage and {k: v[:, columns] for k, v in storage.items()}
+        self.sample_action = sample_action or agent.sample_action
+
+    def rollout(self, iteration: int, restart: bool, rebuild: bool) -> tuple[dict, Optional[str]]:
+        """All noise follows from seed, iteration and actor. Returns what `rollout` does, and what was not finite."""
+        args = self.args
+        seed_all(args.seed, iteration, RANK, self.index)
+        if restart:
+            seeds = np.random.SeedSequence([args.seed, iteration, RANK]).generate_state(args.num_envs)
+            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+            options = dict(reconfigure=True) if rebuild else None
+            with torch.no_grad():
+                self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
+        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, args, self.sample_action)
+        shape = self.storage["rewards"].shape
+        names = {"obs": "observation", "rewards": "reward", "next_values": "value"}
+        derived = ("actions", "logprobs", "values", "dones")  # from the others
+        checked = {names.get(k, k): v for k, v in self.storage.items() if v.is_floating_point() and k not in derived}
+        finite = torch.stack([v.isfinite().view(*shape, -1).all(-1).all(0) for v in checked.values()])
+        if finite.all():
+            return sums, None
+        names = [name for name, row in zip(checked, finite) if not row.all()]
+        broken = (~finite.all(0)).nonzero().flatten()
+        # scenes that ManiSkill rebuilds now and then are so all at once
+        self.obs, _ = self.envs.reset(options=None if args.reconfiguration_freq else dict(env_idx=broken))
+        env_idx = (broken.cpu() + self.env_idx.start).tolist()
+        return sums, f"non-finite {', '.join(names)} in environments {env_idx}"
+
+    def evaluate(self, num_episodes: int, seed: int, num_steps: int, rebuild: int) -> dict[str, torch.Tensor]:
+        """This actor's part of the episodes that start from `seed` on."""
+        episodes = part(num_episodes, self.index, self.args.num_actors)
+        first = seed + episodes.start
+        return evaluate(self.agent, self.eval_envs, len(episodes), first, num_steps, rebuild, self.separately)
+
+    def close(self) -> None:
+        for envs in (self.envs, self.eval_envs):
+            if envs is not None:
+                envs.close()
+
+
+def check_shared_memory(needed: int) -> None:
+    """Refuse what does not fit into the memory that processes share: it would end in a bare 'Bus error'."""
+    free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else math.inf
+    if needed > free:
+        fail(f"{needed / 2**20:,.0f} MiB of shared memory are needed, and {free / 2**20:,.0f} are free: give the "
+             "container more (--shm-size), or use fewer environments or steps, or --num_actors 1")  # fmt: skip
+
+
+def share_memory(agent: nn.Module, storage: dict) -> None:
+    """Move them to memory that all processes see."""
+    check_shared_memory(sum(x.numel() * x.element_size() for x in [*agent.state_dict().values(), *storage.values()]))
+    agent.share_memory()
+    for x in storage.values():
+        x.share_memory_()
+
+
+def run_actor(conn, *arguments) -> None:
+    """Body of a further process: build an actor, then answer each message, a method and its arguments, with one."""
     torch.set_num_threads(1)
-    torch.inference_mode().__enter__()  # never left: what is made in it cannot be written outside
-
-    envs, streams = [], []
-
-    def in_own_stream(i, function, *args, **kwargs):
-        torch.set_rng_state(streams[i])
-        result = function(*args, **kwargs)
-        streams[i] = torch.get_rng_state()
-        return result
-
-    def batch(infos):
-        return {
-            k: (torch.cat if v.ndim else torch.stack)([info[k] for info in infos]).numpy()
-            if isinstance(v, torch.Tensor)
-            else v
-            for k, v in (infos[0].items() if infos else ())
-        }
-
-    def reset(rows, seeds=None, options=None):
-        infos = []
-        for i in rows:
-            seed = None if seeds is None else seeds[i]
-            if seed is not None:
-                streams[i] = torch.Generator().manual_seed(stream_seed(seed)).get_state()
-                np.random.seed(seed)
-                random.seed(seed)
-            first_obs, info = in_own_stream(i, envs[i].reset, seed=seed, options=options)
-            for k, v in as_dict(first_obs).items():
-                reset_obs[k][i] = v[0]
-            infos.append(info)
-        return batch(infos)
-
     try:
-        for index in indices:
-            torch.manual_seed(index)
-            np.random.seed(index)
-            envs.append(make_env(index))
-            streams.append(torch.get_rng_state())
-            conn.send("built")
-        spaces = [envs[0].get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action")]
-        conn.send((spaces, find_max_episode_steps_value(envs[0])))
-        share = slice(indices[0], indices[-1] + 1)
-        obs, reset_obs, *others = conn.recv()
-        obs, reset_obs = [{k: v[share] for k, v in buffers.items()} for buffers in (obs, reset_obs)]
-        rewards, terminated, truncated, actions = [buffer[share] for buffer in others]
+        actor = Actor(*arguments)
+        conn.send("built")
         while True:
             try:
-                command, *arguments = conn.recv()
-            except EOFError:  # the main process closed the pipe
+                method, *rest = conn.recv()
+            except EOFError:  # the main process closed the pipe, or is gone
                 break
-            if command == "step":
-                results = [in_own_stream(i, env.step, actions[i : i + 1]) for i, env in enumerate(envs)]
-                next_obs, *tensors, infos = zip(*results)
-                for k, buffer in obs.items():
-                    torch.cat([as_dict(x)[k] for x in next_obs], out=buffer)
-                for buffer, rows in zip((rewards, terminated, truncated), tensors):
-                    torch.cat(rows, out=buffer)
-                infos = batch(infos)  # before the resets, which write into the same tensors
-                ended = truncated if ignore_terminations else terminated | truncated
-                conn.send((infos, reset(ended.nonzero().flatten().tolist() if auto_reset else [])))
-            else:
-                conn.send(reset(*arguments))
+            conn.send(getattr(actor, method)(*rest))
+        actor.close()
     except ConnectionError:
-        pass  # it did so while it was to be answered, or is gone
+        pass  # the main process is gone
     except BaseException:
         with contextlib.suppress(ConnectionError):
             conn.send(RunError(f"failed:\n{traceback.format_exc()}"))
-    for env in envs:
-        env.close()
 
 
-def to_device(x, device):
-    """A tensor, or a dict of them, on the device; from the CPU without waiting for it."""
-    if isinstance(x, dict):
-        return {k: to_device(v, device) for k, v in x.items()}
-    if x.device.type == "cpu" and device.type == "cuda":
-        return x.pin_memory().to(device, non_blocking=True)
-    return x.to(device)
+class Actors:
+    """Actor 0, in this process, and with CPU simulation further ones in processes of their own.
 
+    Raises RunError, with the traceback or the exit code, where one of them fails."""
 
-class CPUVectorEnv(gym.Env):
-    """`num_envs` CPU-simulated environments as one batched environment, to be wrapped by ManiSkillVectorEnv.
-
-    Worker processes, one a core, each step their share of the environments one after the other. Observations,
-    rewards, flags and actions pass through shared memory, and a step costs one message to each worker and one back:
-    with `auto_reset` a worker also resets the episodes that ended, so that the partial reset which ManiSkillVectorEnv
-    asks for next finds its work done.
-
-    Args:
-        make_env: picklable function from an index in [0, num_envs) to a ManiSkill environment with num_envs=1.
-        ignore_terminations: as given to ManiSkillVectorEnv: whether an episode ends at its time limit only.
-        description: what a progress bar calls the environments while they are built.
-
-    Raises:
-        RunError: with the traceback or the exit code of a worker that failed.
-    """
-
-    device = torch.device("cpu")
-    reconfiguration_freq = 0  # as a batch; each environment is a scene of its own and keeps its own frequency
-
-    def __init__(self, make_env, num_envs, num_workers, auto_reset=True, ignore_terminations=False, description=""):
-        self.num_envs, self.metadata = num_envs, {}
+    def __init__(self, args: Args, trajectory_dir: Path):
         context = mp.get_context("spawn")
-        self.shares = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(num_workers, num_envs))]
-        self.conns, self.workers = [], []
-        # inherited by the workers: to stop is for the main process alone to decide, whom it then tells
+        self.conns, self.processes = [], []
+        # inherited by the processes: they ignore these signals, and the main process tells them when to stop
         handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOP_SIGNALS}
-        for share in self.shares:
-            conn, worker_conn = context.Pipe()
-            worker = context.Process(
-                target=cpu_worker, args=(worker_conn, make_env, share, auto_reset, ignore_terminations), daemon=True
-            )
-            worker.start()
-            worker_conn.close()  # so that a dead worker reads as the end of its pipe
+        for index in range(1, args.num_actors):
+            conn, other_end = context.Pipe()
+            process = context.Process(target=run_actor, args=(other_end, args, index, trajectory_dir), daemon=True)
+            process.start()
+            other_end.close()  # so that a dead process reads as the end of its pipe
             self.conns.append(conn)
-            self.workers.append(worker)
+            self.processes.append(process)
         for s, handler in handlers.items():
             signal.signal(s, handler)
         try:
-            with tqdm(total=num_envs, desc=description, leave=False, disable=None, delay=2) as bar:
-                for i in range(len(self.shares[0])):
-                    for w, share in enumerate(self.shares):
-                        if i < len(share):
-                            self._receive(w)
-                            bar.update()
-            spaces, self.max_episode_steps = [self._receive(w) for w in range(len(self.conns))][0]
+            self.local = Actor(args, 0, trajectory_dir)
+            for i in range(len(self.conns)):
+                self._receive(i)
         except BaseException:
             self.close()
             raise
-        self.single_observation_space, self.single_action_space = spaces
-        self.observation_space, self.action_space = [gym.vector.utils.batch_space(s, num_envs) for s in spaces]
-        self.obs, self.reset_obs = [
-            {k: torch.from_numpy(np.zeros((num_envs, *s.shape), s.dtype)) for k, s in as_dict(spaces[0]).items()}
-            for _ in range(2)
-        ]
-        self.rewards, self.actions = torch.zeros(num_envs), torch.zeros(num_envs, *spaces[1].shape)
-        self.terminated, self.truncated = torch.zeros(2, num_envs, dtype=torch.bool)
-        buffers = [self.obs, self.reset_obs, self.rewards, self.terminated, self.truncated, self.actions]
-        for buffer in (*self.obs.values(), *self.reset_obs.values(), *buffers[2:]):
-            buffer.share_memory_()
-        self._send([buffers] * len(self.conns))
-        self.infos, self.reset_infos = {}, []
 
-    def _send(self, messages):
-        for conn, message in zip(self.conns, messages):
-            with contextlib.suppress(ConnectionError):  # _receive tells what became of the worker
-                conn.send(message)
-
-    def _receive(self, w):
+    def _receive(self, i: int):
         try:
-            message = self.conns[w].recv()
+            message = self.conns[i].recv()
         except (EOFError, ConnectionResetError):
-            self.workers[w].join(5)
-            code = self.workers[w].exitcode
-            message = RunError(f"died with exit code {code}" + " (killed; out of memory?)" * (code == -9))
+            self.processes[i].join(5)
+            code = self.processes[i].exitcode
+            message = RunError(f"died with exit code {code}" + (" (killed; out of memory?)" if code == -9 else ""))
         if isinstance(message, RunError):
-            raise RunError(f"worker {w} (environments {self.shares[w][0]} to {self.shares[w][-1]}) {message}")
+            raise RunError(f"actor {i + 1} {message}")
         return message
 
-    @staticmethod
-    def _concatenate(infos):
-        return {
-            k: torch.from_numpy(np.concatenate([info[k] for info in infos])) if isinstance(v, np.ndarray) else v
-            for k, v in infos[0].items()
-        }
-
-    def _observation(self):
-        obs = {k: v.clone() for k, v in self.obs.items()}
-        return obs if isinstance(self.single_observation_space, gym.spaces.Dict) else obs["state"]
-
-    @property
-    def elapsed_steps(self) -> torch.Tensor:
-        return self.infos["elapsed_steps"]
-
-    def step(self, actions: torch.Tensor):
-        self.actions.copy_(actions)
-        self._send([("step",)] * len(self.conns))
-        infos, self.reset_infos = zip(*[self._receive(w) for w in range(len(self.conns))])
-        self.infos = self._concatenate(infos)
-        results = [x.clone() for x in (self.rewards, self.terminated, self.truncated)]
-        return self._observation(), *results, dict(self.infos)
-
-    def reset(self, *, seed=None, options=None):
-        options = dict(options or {})
-        env_idx = torch.as_tensor(options.pop("env_idx", range(self.num_envs))).sort().values
-        if not any(self.reset_infos):  # otherwise the workers did it together with the step that ended the episodes
-            if isinstance(seed, int):  # ManiSkill's rule for one seed and several environments
-                seed = [seed] + np.random.RandomState(seed).randint(2**31, size=self.num_envs - 1).tolist()
-            chosen = [[i for i, index in enumerate(share) if (env_idx == index).any()] for share in self.shares]
-            seeds = [seed and [seed[index] for index in share] for share in self.shares]
-            self._send([("reset", rows, s, options) for rows, s in zip(chosen, seeds)])
-            self.reset_infos = [self._receive(w) for w in range(len(self.conns))]
-        infos = self._concatenate([info for info in self.reset_infos if info])
-        self.reset_infos = []
-        for k, v in infos.items():
-            if isinstance(v, torch.Tensor) and len(env_idx) < self.num_envs:
-                infos[k] = self.infos[k].index_copy(0, env_idx, v)
-        self.infos = infos
-        for k, obs in self.obs.items():
-            obs[env_idx] = self.reset_obs[k][env_idx]
-        return self._observation(), dict(infos)
-
-    def close(self):
+    def _send(self, *message) -> None:
         for conn in self.conns:
-            conn.close()  # which is how a worker learns that it is over
-        for worker in self.workers:
-            worker.join(30)
-            worker.kill()
+            with contextlib.suppress(ConnectionError):  # _receive says what became of the process
+                conn.send(message)
 
+    def call(self, method: str, *arguments) -> list:
+        """Call a method of all actors at once; returns their results in order."""
+        self._send(method, *arguments)
+        result = getattr(self.local, method)(*arguments)
+        return [result, *(self._receive(i) for i in range(len(self.conns)))]
 
-def workers_memory(envs: ManiSkillVectorEnv) -> float:
-    """Resident memory in MiB of the worker processes, if any; RunError where one of them has died."""
-    if not isinstance(envs.base_env, CPUVectorEnv):
-        return 0.0
-    dead = [w for w, worker in enumerate(envs.base_env.workers) if not worker.is_alive()]
-    if dead:
-        envs.base_env._receive(dead[0])
-    return sum(psutil.Process(worker.pid).memory_info().rss for worker in envs.base_env.workers) / 2**20
+    def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
+        """Hand the weights and the storage to all, in shared memory where there are others."""
+        if self.processes:
+            share_memory(agent, storage or {})
+        self._send("connect", agent, storage)
+        self.local.connect(agent, storage, sample_action)
+        for i in range(len(self.conns)):
+            self._receive(i)
 
+    def memory(self) -> float:
+        """Resident memory of the further processes in MiB."""
+        return sum(psutil.Process(process.pid).memory_info().rss for process in self.processes) / 2**20
 
-def make_envs(args: Args, record_dir: Path, evaluation: bool = False) -> ManiSkillVectorEnv:
-    """The training or the evaluation environments as one batch. Those for evaluation do not reset by themselves:
-    `evaluate` starts each episode from its seed."""
-    num_envs = args.num_eval_envs if evaluation else args.num_envs
-    ignore_terminations = not (args.eval_partial_reset if evaluation else args.partial_reset)
-    make = partial(make_env, args, record_dir, evaluation)
-    if args.sim_backend == "physx_cpu" and num_envs > 1:
-        what = "building evaluation environments" if evaluation else "building training environments"
-        env = CPUVectorEnv(make, num_envs, num_cores(), not evaluation, ignore_terminations, what)
-    else:
-        env = make(num_envs=num_envs)
-    return ManiSkillVectorEnv(
-        env, auto_reset=not evaluation, ignore_terminations=ignore_terminations, record_metrics=True
-    )
+    def close(self) -> None:
+        for conn in self.conns:
+            conn.close()  # by which an actor learns that it is over
+        if hasattr(self, "local"):
+            self.local.close()
+        for process in self.processes:
+            process.join(10)
+            process.kill()
 
 
 # ----- Agent ----------------------------------------------------------------------------------------------------------
@@ -996,13 +1366,22 @@ class Agent(nn.Module):
         """The deterministic action: the mean of the policy."""
         return self.actor_mean(self.features(obs))
 
-    def get_action_and_value(self, obs, action=None):
-        """Returns action (sampled unless given), its log-probability, the policy's entropy, and the value."""
-        features = self.features(obs)
+    def get_policy(self, features):
         mean = self.actor_mean(features)
-        policy = Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
-        if action is None:  # not policy.sample(), for which the host waits: torch.normal looks at the deviations
-            action = (mean + policy.stddev * torch.randn_like(mean)).detach()
+        return Normal(mean, self.actor_logstd.exp().expand_as(mean), validate_args=False)
+
+    def sample_action(self, obs):
+        """Returns an action drawn from the policy, its log-probability, and the value, for one look at the images."""
+        features = self.features(obs)
+        policy = self.get_policy(features)
+        # not policy.sample(), for which the host waits: torch.normal looks at the deviations
+        action = (policy.mean + policy.stddev * torch.randn_like(policy.mean)).detach()
+        return action, policy.log_prob(action).sum(-1), self.critic(features).squeeze(-1)
+
+    def get_action_and_value(self, obs, action):
+        """Returns the action, its log-probability, the policy's entropy, and the value."""
+        features = self.features(obs)
+        policy = self.get_policy(features)
         value = self.critic(features).squeeze(-1)
         return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
 
@@ -1123,39 +1502,46 @@ def as_cuda_graph(function, enabled: bool):
     """`function`, launched as one CUDA graph: a network so small computes faster than its kernels can be launched one
     by one.
 
-    It takes no arguments, never makes the host wait, and finds the tensors that it reads and writes always in the same
-    place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of their own,
-    as capturing wants it, and the third looks whether the host waits, in which case it is never captured; the next one
-    captures it, and those after that replay.
+    It takes nothing or an observation, never makes the host wait, and finds the tensors that it reads and writes always
+    in the same place; what it returns is overwritten by the next call. The first calls run it as it is, on a stream of
+    their own, as capturing wants it, and the third looks whether the host waits, in which case it is never captured;
+    the next one captures it, and those after that replay.
 
     Raises:
         RunError: where the capture fails, after which CUDA's random numbers cannot be used any more."""
     if not enabled:
         return function
     graph, stream, num_calls, result, waits = torch.cuda.CUDAGraph(), torch.cuda.Stream(), 0, None, []
+    name, run, held = function.__name__, function, None
 
-    def launch():
-        nonlocal num_calls, result, waits
+    def launch(obs=None):
+        nonlocal num_calls, result, waits, run, held
         num_calls += 1
+        if obs is not None:
+            if held is None:
+                held = copy.deepcopy(obs)  # where the graph finds it
+                run = partial(function, held)
+            for k, v in as_dict(held).items():
+                v.copy_(as_dict(obs)[k])
         if num_calls <= 3:
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                result, waits = call_and_look_for_waits(function) if num_calls == 3 else (function(), [])
+                result, waits = call_and_look_for_waits(run) if num_calls == 3 else (run(), [])
             torch.cuda.current_stream().wait_stream(stream)
             if waits:
-                tqdm.write(f"{function.__name__}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
+                tqdm.write(f"{name}: no CUDA graph, since {waits[0]} makes the host wait for the GPU")
             return result
         if waits:
-            return function()
+            return run()
         if num_calls == 4:
             gc.collect()  # what is collected during the capture might free memory of the GPU, which ends the capture
             try:  # other threads, as those of NCCL, go on meanwhile
                 with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-                    result = function()
+                    result = run()
             except RuntimeError as error:
                 while error.__context__:  # what stopped it, rather than that it was stopped
                     error = error.__context__
-                raise RunError(f"{function.__name__}: no CUDA graph (try --no-cudagraphs): {error}") from None
+                raise RunError(f"{name}: no CUDA graph (try --no-cudagraphs): {error}") from None
         graph.replay()
         return result
 
@@ -1167,36 +1553,46 @@ def as_cuda_graph(function, enabled: bool):
 
 @torch.no_grad()
 def evaluate(
-    agent, envs, num_episodes: int, seed: int, num_steps: int, device, options=None
+    agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild: int = 0, separately=False, exploring=False
 ) -> dict[str, torch.Tensor]:
-    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k (on a
-    GPU ManiSkill draws those of a batch from its first seed). Of several processes, each runs `num_episodes`, of seeds
-    that follow on each other.
+    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
+
+    Args:
+        rebuild: build new scenes, from the seeds too, in every so many rounds of all environments; 0: never.
+        separately: as `start_episodes` has it.
+        exploring: take random actions, as training does.
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
-    float tensor (num_episodes of all processes,) each, on the CPU."""
-    low, high = action_bounds(envs, device)
-    rounds = []
-    seed += RANK * num_episodes
+    float tensor (num_episodes,) each, on the CPU."""
+    low, high = action_bounds(envs, envs.device)
     seed_all(seed)  # for tasks that draw during an episode
+    rounds = []
     for first in range(seed, seed + num_episodes, envs.num_envs):
-        obs, _ = envs.reset(seed=list(range(first, first + envs.num_envs)), options=options)
+        seeds = list(range(first, first + envs.num_envs))
+        if rebuild and len(rounds) % rebuild == 0:
+            envs.reset(seed=seeds, options=dict(reconfigure=True))
+        obs = start_episodes(envs, seeds, separately)
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
         episodes = {}
         for step in range(1, num_steps + 1):
-            action = agent.get_action(to_device(obs, device)).clamp(low, high).nan_to_num()
-            obs, _, terminated, truncated, infos = envs.step(action.to(envs.device))
+            action = agent.sample_action(obs)[0] if exploring else agent.get_action(obs)
+            obs, _, terminated, truncated, infos = envs.step(action.clamp(low, high).nan_to_num())
             ended = running & (terminated | truncated | (step == num_steps))
             running &= ~ended
             at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
             for k, v in (infos["episode"] | at_end).items():
                 episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+        if isinstance(envs._env, RecordEpisode) and envs._env.save_trajectory:
+            envs._env.flush_trajectory()
         rounds.append(episodes)
-    share = {
-        k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in rounds[0] if k != "reward"
-    }
-    parts = gather(share)
-    return {k: torch.cat([part[k] for part in parts]) for k in share}
+    names = [k for k in (rounds[0] if rounds else {}) if k != "reward"]
+    return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in names}
+
+
+def join(parts: list[dict]) -> dict[str, torch.Tensor]:
+    """Episodes of several actors or processes, in order."""
+    parts = [part for part in parts if part]
+    return {k: torch.cat([part[k] for part in parts]) for k in parts[0]}
 
 
 def interval(values: torch.Tensor, rate: bool) -> tuple[float, float]:
@@ -1258,11 +1654,15 @@ def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path, args: Arg
     agent.load_state_dict(checkpoint["agent"])
 
 
-def name_videos(folder: Path, name: str) -> list[Path]:
-    """RecordEpisode numbers its files; name the new ones after the evaluation that they show."""
-    numbered = sorted(path for path in folder.glob("*.mp4") if path.stem.isdigit())
-    names = [f"{name}.mp4" if len(numbered) == 1 else f"{name}_{i}.mp4" for i in range(len(numbered))]
-    return [path.replace(folder / new) for path, new in zip(numbered, names)]
+def open_metrics(run_dir: Path):
+    """metrics.jsonl, for this process alone to write: two that resume one run would write every row twice."""
+    file = open(run_dir / "metrics.jsonl", "ab")
+    try:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
+    return file
 
 
 def read_metrics(run_dir: Path) -> Iterator[dict]:
@@ -1316,8 +1716,8 @@ def plot_learning_curve(run_dir: Path) -> None:
 
 
 LIMITS = (  # of numbers that are given; none may be infinite or not a number
-    (1, 1e18, "num_envs num_eval_envs num_steps num_minibatches update_epochs num_eval_episodes num_eval_steps "
-              "total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+    (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
+              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1, 32, "frame_stack"),
     (8, 4096, "camera_width camera_height"),
     (0, 32, "random_shift"),
@@ -1337,6 +1737,12 @@ def check(args: Args) -> None:
                 fail(f"--{flag} {getattr(args, flag)}: must lie between {low:g} and {high:g}")
     if args.num_envs % WORLD_SIZE:
         fail(f"--num_envs {args.num_envs} cannot be shared out equally among {WORLD_SIZE} processes")
+    if args.num_actors > args.num_envs:
+        fail(f"--num_actors {args.num_actors}: there are {args.num_envs} environments (--num_envs) to share out")
+    if args.num_actors > WORLD_SIZE and args.sim_backend.startswith("physx_cuda"):
+        fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
+    if args.num_actors % WORLD_SIZE:
+        fail(f"--num_actors {args.num_actors} cannot be shared out equally among {WORLD_SIZE} processes")
     if WORLD_SIZE > 1 and args.evaluate:
         fail("--evaluate is for one process: leave out torchrun")
     if args.batch_size < args.num_minibatches * WORLD_SIZE:
@@ -1426,12 +1832,14 @@ def check(args: Args) -> None:
     for asset in assets:
         if not all(map(is_data_source_downloaded, expand_data_group_into_individual_data_source_ids(asset))):
             fail(f"--env_id {args.env_id} needs assets: python -m mani_skill.utils.download_asset {asset}")
-    if args.reconfiguration_freq and args.partial_reset and on_gpu and not args.evaluate:
-        fail("--reconfiguration_freq rebuilds all environments at once: on a GPU it needs --no-partial_reset")
+    if args.reconfiguration_freq and args.partial_reset and args.num_envs > args.num_actors and not args.evaluate:
+        fail("--reconfiguration_freq rebuilds all environments of a batch at once: it needs --no-partial_reset")
 
     # --- the folder ---
     run_dir = find_run_dir(args)
     try:
+        if args.resume and RANK == 0:
+            open_metrics(run_dir).close()
         if not (args.resume or args.evaluate):
             metrics = run_dir / "metrics.jsonl"
             if (run_dir / "last.pt").exists() or metrics.exists() and metrics.stat().st_size > 0:
@@ -1481,7 +1889,7 @@ def find_cameras(args: Args, spec, robots: list) -> Optional[list[tuple[int, int
 
 
 def check_observations(args: Args, spec, robots: list) -> None:
-    """Refuse images that nothing can render, and more of them than the learner's device can hold."""
+    """Refuse images that nothing can render, and more of them than the memory can hold."""
     textures = args.obs_mode.split("+")
     if not set(textures) <= TEXTURES.keys() or len(set(textures)) < len(textures):
         fail(f"--obs_mode {args.obs_mode}: must be some of {', '.join(TEXTURES)}, joined by +")
@@ -1518,15 +1926,16 @@ def check_observations(args: Args, spec, robots: list) -> None:
         return
     args = args.share()
     device, needed = choose_device(args), image_bytes(args, cameras)
-    if device.type == "cuda":
-        free = torch.cuda.mem_get_info(device)[0]
-    else:
-        free = psutil.virtual_memory().available / LOCAL_WORLD_SIZE
+    free = psutil.virtual_memory().available / LOCAL_WORLD_SIZE if not on_gpu else math.inf
+    if device.type == "cuda":  # which has a copy of them, where the simulation is on the CPU
+        free = min(free, torch.cuda.mem_get_info(device)[0])
     print(f"images of a rollout ({sizes}, {args.num_steps} steps of {args.num_envs} environments): "
           f"{needed / 2**20:,.1f} MiB of {free / 2**20:,.0f} free")  # fmt: skip
     if needed > 0.9 * free:
-        fail(f"the images of a rollout do not fit on the learner's device: try --num_steps "
+        fail(f"the images of a rollout do not fit into the memory: try --num_steps "
              f"{max(1, int(args.num_steps * 0.5 * free / needed))}, fewer environments or smaller images")  # fmt: skip
+    if args.num_actors > 1:
+        check_shared_memory(LOCAL_WORLD_SIZE * (needed + 16 * 2**20))  # with the weights and the rest of a rollout
 
 
 def choose_device(args: Args) -> torch.device:
@@ -1562,17 +1971,23 @@ def prepare_rendering(args: Args) -> None:
 
 def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     """--evaluate: build the evaluation environments and the agent, nothing else; print, film and write the results."""
-    run_dir, device = find_run_dir(args), choose_device(args)
+    run_dir = find_run_dir(args)
     prepare_rendering(args)
     torch.set_num_threads(1)
-    envs = make_envs(args, run_dir / "test_videos", evaluation=True)
-    closing.callback(envs.close)
-    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
+    actors = Actors(args, run_dir / "test_videos")
+    closing.callback(actors.close)
+    envs = actors.local.eval_envs
+    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(envs.device)
     load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint, args)
+    actors.connect(agent)
     num_episodes, num_steps = evaluation_size(envs, args)
-    episodes = evaluate(agent, envs, num_episodes, args.eval_seed, num_steps, device)
-    envs.close()  # which completes the videos
-    videos = name_videos(run_dir / "test_videos", f"seed_{args.eval_seed}")
+    episodes = join(actors.call("evaluate", num_episodes, args.eval_seed, num_steps, rebuilding(args)))
+    film = Film(args, run_dir / "test_videos")
+    closing.callback(film.close)
+    for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs) if args.capture_video else ():
+        film.record(agent, f"seed_{seed}", num_steps, seed)
+    actors.close()  # which completes the trajectories
+    videos = sorted((run_dir / "test_videos").glob("seed_*.mp4"))
 
     results = {"env_id": args.env_id, "num_episodes": num_episodes, "eval_seed": args.eval_seed}
     print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {args.eval_seed} on, 95% intervals:")
@@ -1585,6 +2000,46 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     return 0
 
 
+@torch.no_grad()
+def rollout(agent, envs, storage: dict, obs, args: Args, sample_action):
+    """Act for num_steps in every environment of one actor, and write what happens into its columns of the storage.
+
+    Args:
+        storage: images, state, actions, logprobs, rewards, dones, values, next_values, (num_steps, num_envs, ...) each;
+            next_values[t] is the value of the true next observation of step t (of the final one where the episode
+            ended, or zero where its end is not bootstrapped).
+        obs: the first observation, as ImageObservations makes it.
+        sample_action: agent.sample_action, or a CUDA graph of it.
+
+    Returns:
+        the next observation, and the sums over the episodes that ended of what is known of each: a dict of scalars."""
+    low, high = action_bounds(envs, envs.device)
+    final_values = torch.zeros_like(storage["next_values"])
+    sums = {"num_episodes": torch.zeros((), device=envs.device)}
+    for step in range(args.num_steps):
+        action, logprob, value = sample_action(obs)
+        for name, x in obs.items():
+            storage[name][step] = x
+        storage["actions"][step], storage["logprobs"][step], storage["values"][step] = action, logprob, value
+        # the simulator takes no NaN; the observations keep it, and a check finds it there
+        obs, reward, terminated, truncated, infos = envs.step(action.clamp(low, high).nan_to_num())
+        done = terminated | truncated
+        storage["rewards"][step] = reward * args.reward_scale
+        storage["dones"][step] = done
+        if "final_observation" in infos:  # some episodes ended, and obs is the first of the next ones there
+            counts = bootstraps(args.bootstrap_at_done, terminated, truncated)
+            final_values[step] = torch.where(counts, agent.get_value(infos["final_observation"]), 0.0)
+            final_infos = {"num_episodes": torch.ones_like(reward), **infos["final_info"]["episode"]}
+            for key, value in infos["final_info"].items():  # a task's own numbers, such as is_grasped
+                if isinstance(value, torch.Tensor) and value.shape == done.shape:
+                    final_infos[f"final_{key}"] = value
+            for key, value in final_infos.items():
+                sums[key] = sums.get(key, 0.0) + torch.where(done, value.float(), 0.0).sum()
+    following = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
+    storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following))
+    return obs, sums
+
+
 def train(args: Args, closing: contextlib.ExitStack) -> int:
     """The training run, from the folder to the last checkpoint; the loop stands here in one piece.
 
@@ -1593,7 +2048,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
     run_dir = find_run_dir(args)
-    given = asdict(args)
+    given = asdict(args)  # before it is fitted to this machine: a resumed run may be on another
     device = choose_device(args.share())
     if device.type == "cuda":
         torch.cuda.set_device(device)  # where CUDA graphs are captured
@@ -1619,10 +2074,14 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
     seed_all(args.seed)
 
-    envs = make_envs(share, run_dir / "train_videos")
-    closing.callback(envs.close)
+    actors = Actors(share, run_dir / "videos")
+    closing.callback(actors.close)
+    envs = actors.local.envs
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
-    low, high = action_bounds(envs, device)
+    ends_early = share.partial_reset and {"success", "fail"} & envs.reset()[1].keys()
+    if ends_early and not can_reset_some(envs):
+        fail(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives each a "
+             "process of its own; or reset all together: --no-partial_reset")  # fmt: skip
 
     agent = Agent(obs_space, action_space, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
@@ -1644,12 +2103,30 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     if WORLD_SIZE > 1:  # the same weights, whatever each machine made of the seed
         agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
+    num_eval_episodes, max_eval_steps = evaluation_size(actors.local.eval_envs, share)
+
+    # --- storage: where the environments are; on another device the learner has a copy of it, and of the agent ---
+    shape = (args.num_steps, share.num_envs)
+    names = ("logprobs", "rewards", "dones", "values", "next_values")
+    storage = {name: torch.zeros(shape, device=envs.device) for name in names}
+    for name, space in obs_space.items():  # images in the dtype in which they are rendered: a quarter of the memory
+        storage[name] = torch.zeros(*shape, *space.shape, dtype=getattr(torch, space.dtype.name), device=envs.device)
+    storage["actions"] = torch.zeros(*shape, *action_space.shape, device=envs.device)
+    one_device = envs.device.type == device.type
+    on_device = storage if one_device else {k: v.to(device) for k, v in storage.items()}
+    acting_agent = agent if one_device else copy.deepcopy(agent).to(envs.device)
+    cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
+    sample_action = acting_agent.sample_action
+    if args.compile:
+        sample_action = torch.compile(sample_action, dynamic=False)
+    if one_device:
+        sample_action = cuda_graph(sample_action)
+    actors.connect(acting_agent, storage, sample_action)
     if args.compile:
         agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
-
-    eval_envs = make_envs(share, run_dir / "videos", evaluation=True)
-    closing.callback(eval_envs.close)
-    num_eval_episodes, max_eval_steps = evaluation_size(eval_envs, share)
+    film, train_film = Film(share, run_dir / "videos"), Film(share, run_dir / "train_videos")
+    closing.callback(film.close)
+    closing.callback(train_film.close)
 
     # --- logging ---
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -1670,7 +2147,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             config=about, save_code=True, id=wandb_id, resume="allow",
         ).id  # fmt: skip
         closing.push(lambda error, *_: wandb.finish(exit_code=int(error is not None)))
-    metrics_file, writer = open(run_dir / "metrics.jsonl", "ab"), None
+    metrics_file, writer = open_metrics(run_dir), None
     kept = (run_dir / "metrics.jsonl").read_bytes()[: resumed.get("metrics_size", 0)]  # later steps are done again
     metrics_file.truncate(kept.rfind(b"\n") + 1)
     metrics_file.seek(0, os.SEEK_END)
@@ -1725,43 +2202,19 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     def save(name: str, contents: dict) -> bool:
         return not share.save_model or attempt(name, save_checkpoint, run_dir / name, contents)
 
-    # --- rollout storage ---
-    shape = (args.num_steps, share.num_envs)
-    obs = {  # images in the dtype in which they were rendered: as numbers they would take four times the memory
-        k: torch.zeros(*shape, *space.shape, dtype=getattr(torch, space.dtype.name), device=device)
-        for k, space in obs_space.items()
-    }
-    next_obs = {k: torch.zeros_like(v[0]) for k, v in obs.items()}
-    actions = torch.zeros(*shape, *action_space.shape, device=device)
-    logprobs, rewards, dones, values, next_values, advantages, returns = torch.zeros(7, *shape, device=device)
-    t = torch.zeros(1, dtype=torch.long, device=device)  # the step of the rollout, where a CUDA graph finds it
+    # --- what the learner makes of it ---
+    advantages, returns = torch.zeros(2, *shape, device=device)
     permutation = torch.zeros(share.batch_size, dtype=torch.long, device=device)
-    b_obs = {k: v.flatten(0, 1) for k, v in obs.items()}  # the same memory
-    batch = [x.flatten(0, 1) for x in (actions, logprobs, advantages, returns, values)]
-
-    def observe(new_obs):
-        for k, v in to_device(new_obs, device).items():
-            next_obs[k].copy_(v)
+    flat = {name: x.flatten(0, 1) for name, x in on_device.items()}  # the same memory
+    b_obs = {name: flat[name] for name in obs_space}
+    b_actions, b_logprobs, b_values = [flat[name] for name in ("actions", "logprobs", "values")]
+    batch = [b_actions, b_logprobs, advantages.flatten(), returns.flatten(), b_values]
 
     # --- what needs no look from the host, and is launched as a whole where that is faster ---
-    cuda_graph = partial(as_cuda_graph, enabled=args.cudagraphs and device.type == "cuda")
-
-    @cuda_graph
-    @torch.no_grad()
-    def policy_step():
-        """Into row t of the rollout; returns the actions as the simulator can take them."""
-        action, logprob, _, value = agent.get_action_and_value(next_obs)
-        for k, v in next_obs.items():
-            obs[k][t] = v
-        actions[t], logprobs[t], values[t] = action, logprob, value
-        t.add_(1)
-        return action.clamp(low, high).nan_to_num()  # the simulator takes no NaN; a check finds it in the observations
-
     @cuda_graph
     @torch.no_grad()
     def estimate_advantages():
-        following = torch.cat([values[1:], agent.get_value(next_obs)[None]])
-        next_values.copy_(torch.where(dones.bool(), next_values, following))
+        rewards, values, next_values, dones = [on_device[k] for k in ("rewards", "values", "next_values", "dones")]
         gae = compute_gae(rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae)
         advantages.copy_(gae[0])
         returns.copy_(gae[1])
@@ -1784,8 +2237,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         nonlocal launch_update_epoch
         launch_update_epoch = None
 
-    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes
-    rebuild = {"reconfigure": True} if args.exact_resume and args.sim_backend == "physx_cpu" else None
+    # PhysX remembers contacts of earlier episodes: what is to be repeatable to the last bit starts in new scenes, and a
+    # batch builds the objects of its task once: to meet others it is rebuilt where that is cheap
+    rebuild = args.sim_backend == "physx_cpu" and (args.exact_resume or varies_objects(find_task(args.env_id)))
 
     # --- how it may end ---
     finished, signalled, stopped_by, failures = False, 0, 0, Counter()
@@ -1825,10 +2279,15 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
         finished = iteration == args.num_iterations and not stopped_by
         if finished or not stopped_by and (iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0):
-            episodes = evaluate(agent, eval_envs, num_eval_episodes, args.eval_seed, max_eval_steps, device, rebuild)
+            if acting_agent is not agent:
+                acting_agent.load_state_dict(agent.state_dict())
+            first = args.eval_seed + RANK * num_eval_episodes
+            episodes = actors.call("evaluate", num_eval_episodes, first, max_eval_steps, rebuilding(args))
+            episodes = join(gather(join(episodes)))
             metrics = {key: value.mean().item() for key, value in episodes.items()}
             attempt("metrics.jsonl", log, "eval", metrics | {"num_episodes": len(episodes["return"])})
-            name_videos(run_dir / "videos", f"step_{global_step:09d}")
+            if share.capture_video:
+                film.record(acting_agent, f"step_{global_step:09d}", max_eval_steps, args.eval_seed)
             score = [metrics[key] for key in ("success_once", "return") if key in metrics]
             best = score > best_score and all(map(math.isfinite, score))
             bar.write(f"step {global_step:>9,}  evaluation: {', '.join(summary(metrics))}" + "  (best)" * best)
@@ -1840,48 +2299,18 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if finished or stopped_by:
             break
 
-        # --- rollout: num_steps in every environment; its noise follows from seed and iteration alone ---
+        # --- rollout: num_steps in every environment, of all actors at once ---
         start = time.perf_counter()
-        seed_all(args.seed, iteration, *[RANK] * (RANK > 0))
-        if iteration == first_iteration or (args.exact_resume and iteration % args.checkpoint_freq == 0):
-            seeds = np.random.SeedSequence([args.seed, iteration]).generate_state(args.num_envs)
-            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
-            observe(envs.reset(seed=seeds[RANK * share.num_envs :][: share.num_envs], options=rebuild)[0])
-        t.zero_()
-        episode_sums = {"num_episodes": torch.zeros((), device=device)}
-        for step in range(args.num_steps):
-            action = policy_step().clone()  # a task may keep it
-            new_obs, *results, infos = envs.step(action.to(envs.device))
-            observe(new_obs)
-            reward, terminated, truncated = [to_device(x, device) for x in results]
-            done = terminated | truncated
-            rewards[step] = reward * args.reward_scale
-            dones[step] = done
-            if "final_observation" in infos:  # next_obs is the first of a new episode where done
-                with torch.no_grad():
-                    final_value = agent.get_value(to_device(infos["final_observation"], device))
-                next_values[step] = final_value * bootstraps(args.bootstrap_at_done, terminated, truncated)
-                final_infos = {"num_episodes": torch.ones_like(reward), **infos["final_info"]["episode"]}
-                for key, value in infos["final_info"].items():  # what the task tells beside, such as is_grasped
-                    if isinstance(value, torch.Tensor) and value.shape == done.shape:
-                        final_infos[f"final_{key}"] = value
-                for key, value in final_infos.items():
-                    total = torch.where(done, to_device(value, device).float(), 0.0).sum()
-                    episode_sums[key] = episode_sums.get(key, 0.0) + total
+        restart = iteration == first_iteration or rebuild and iteration % args.checkpoint_freq == 0
+        if acting_agent is not agent:
+            acting_agent.load_state_dict(agent.state_dict())
+        results = actors.call("rollout", iteration, restart, restart and rebuild)
+        if on_device is not storage:
+            for k, v in storage.items():
+                on_device[k].copy_(v)
         estimate_advantages()
-
-        # --- check: what is not finite must not reach the weights; the host learns of it here, once for all steps ---
-        quantities = {"reward": rewards, "value": next_values} | {k: v for k, v in obs.items() if v.is_floating_point()}
-        broken = ~torch.stack([torch.isfinite(x).view(*shape, -1).all(-1).all(0) for x in quantities.values()])
-        problem = None
-        if broken.any():
-            names = [name for name, row in zip(quantities, broken) if row.any()]
-            env_idx = broken.any(0).nonzero().flatten()
-            problem = f"non-finite {', '.join(names)} in environments {env_idx.tolist()}"
-            # scenes that are rebuilt now and then are so all at once
-            some = None if args.reconfiguration_freq else {"env_idx": env_idx.to(envs.device)}
-            observe(envs.reset(options=some)[0])
-        problem = next(filter(None, gather(problem)), None)  # of any process is one of all
+        # numbers that are not finite must not reach the weights; those of any process are those of all
+        problem = next(filter(None, gather(next(filter(None, [p for _, p in results]), None))), None)
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
@@ -1899,7 +2328,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             if "state" in b_obs:
                 agent.update_normalization(b_obs["state"])
         torch.set_num_threads(1)
-        explained_variance = average(1 - (returns - values).var() / returns.var().clamp(min=1e-8))
+        explained_variance = average(1 - (returns.flatten() - b_values).var() / returns.var().clamp(min=1e-8))
         global_step += args.batch_size
 
         # --- log: here the host waits for the device ---
@@ -1913,8 +2342,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                 load_optimizer(snapshot["optimizer"])
                 launch_update_epoch = cuda_graph(update_epoch)  # the one before knows the optimizer's former tensors
         sums = Counter()
-        for part in gather(dict(zip(episode_sums, torch.stack([*episode_sums.values()]).tolist()))):
-            sums.update(part)
+        of_actors = [dict(zip(x, torch.stack([*x.values()]).tolist())) for x, _ in results]
+        for of_actor in itertools.chain(*gather(of_actors)):
+            sums.update(of_actor)
         num_episodes = sums.pop("num_episodes")
         if num_episodes:
             metrics = {key: total / num_episodes for key, total in sums.items()} | metrics
@@ -1929,7 +2359,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             "rollout_time": rollout_time,
             "update_time": elapsed - rollout_time,
             "memory_mb": psutil.Process().memory_info().rss / 2**20,
-            "workers_memory_mb": workers_memory(envs) + workers_memory(eval_envs),
+            "actors_memory_mb": actors.memory(),
         }
         if device.type == "cuda":
             free, total = torch.cuda.mem_get_info(device)
@@ -1946,6 +2376,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         if bar.disable and time.monotonic() - last_line > 10:  # no terminal
             print(f"step {global_step:>9,}  training: {status}", flush=True)
             last_line = time.monotonic()
+
+        if args.save_train_video_freq and share.save_train_video_freq and iteration % args.save_train_video_freq == 0:
+            train_film.record(acting_agent, f"step_{global_step:09d}", max_eval_steps, args.eval_seed, exploring=True)
 
     if not finished:
         return 128 + stopped_by
