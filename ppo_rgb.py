@@ -1077,7 +1077,9 @@ class Actor:
             record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
         first = RANK * args.num_eval_episodes + part(args.num_eval_episodes, index, args.num_actors).start
         self.eval_envs = make_envs(args, num_eval_envs or 1, args.eval_seed + first, evaluation=True, record=record)
-        self.separately = args.sim_backend == "physx_cpu" and can_reset_some(self.eval_envs)
+        base_env = self.eval_envs.base_env
+        batched = isinstance(base_env, sapien_env.BaseEnv) and is_batch(base_env.scene)
+        self.separately = batched and can_reset_some(self.eval_envs)
 
     def connect(self, agent, storage: Optional[dict] = None, sample_action=None) -> None:
         """What to act with, and what to write into: this actor's columns."""
