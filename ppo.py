@@ -115,6 +115,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.render.utils import can_render
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
+from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Link
@@ -927,6 +928,7 @@ def batch_on_cpu() -> None:
     setup_scene, reset = sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset
     body_data = PhysxRigidBodyComponentStruct._body_data
     set_action, compute_ik = PDEEPosController.set_action, Kinematics.compute_ik
+    build_physx_component = ActorBuilder.build_physx_component
 
     def setup_batch(env):
         if env.num_envs == 1 or env._sim_device.is_cuda():
@@ -946,6 +948,12 @@ def batch_on_cpu() -> None:
         if env._last_obs is None and env.num_envs > 1:  # it is being made
             seed = [env.build_seed + i for i in range(env.num_envs)]
         return reset(env, seed=seed, options=options)
+
+    def build_with_planes(builder, *args, **kwargs):
+        """On a GPU all environments share the ground that the first of them is given."""
+        if is_batch(builder.scene):
+            builder._plane_collision_poses.clear()
+        return build_physx_component(builder, *args, **kwargs)
 
     def body_data_with_velocities(struct):
         if isinstance(struct, Link) and is_batch(struct.scene):
@@ -987,6 +995,7 @@ def batch_on_cpu() -> None:
     sapien_env.BaseEnv.build_seed = 2022  # ManiSkill's; a run sets its own, so that its processes build other objects
     PhysxRigidBodyComponentStruct._body_data = property(body_data_with_velocities)
     PDEEPosController.set_action, Kinematics.compute_ik = set_action_by_pose, compute_ik_by_row
+    ActorBuilder.build_physx_component = build_with_planes
 
 
 batch_on_cpu()
