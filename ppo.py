@@ -114,6 +114,7 @@ from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.render.utils import can_render
+from mani_skill.utils import common
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
@@ -903,7 +904,7 @@ class BatchedCamera:
             camera.take_picture()
 
     def get_picture_cuda(self, name: str) -> SimpleNamespace:
-        pictures = torch.from_numpy(np.stack([camera.get_picture(name) for camera in self.cameras]))
+        pictures = common.to_tensor(np.stack([camera.get_picture(name) for camera in self.cameras]))
         return SimpleNamespace(torch=lambda: pictures)
 
 
