@@ -35,15 +35,21 @@ class BatchedReach(gym.Env):
         return self.state.clone()
 
     def reset(self, *, seed=None, options=None):
-        env_idx = (options or {}).get("env_idx", torch.arange(self.num_envs, device=self.device))
+        env_idx = (options or {}).get("env_idx", torch.arange(self.num_envs)).to(self.device)
         if seed is None:
             fresh = torch.rand(len(env_idx), 4, device=self.device)
-        else:
+        else:  # one for each environment, whichever of them start
             draws = [torch.rand(4, generator=torch.Generator().manual_seed(s)) for s in seed]
-            fresh = torch.stack(draws).to(self.device)
+            fresh = torch.stack(draws).to(self.device)[env_idx]
         self.state[env_idx] = 2 * fresh - 1
         self.elapsed_steps[env_idx] = 0
         return self.observe(), self.info()[0]
+
+    def _set_main_rng(self, seeds):  # of the two generators that ManiSkill's tasks have, and this one has not
+        pass
+
+    def _set_episode_rng(self, seeds, env_idx):
+        pass
 
     def step(self, actions):
         assert (actions.abs() <= 1).all(), "actions come clipped to the action space"
@@ -92,9 +98,8 @@ class BatchedReachImages(BatchedReach):
         return dict(agent=agent, extra={}, sensor_param={}, sensor_data=dict(front=front, back=back))
 
 
-def make_envs(args, record_dir, evaluation=False, device="cpu"):
+def make_envs(args, num_envs, seed, evaluation=False, record=None, device="cpu"):
     """Stands in for make_envs of both scripts."""
-    num_envs = args.num_eval_envs if evaluation else args.num_envs
     if args.obs_mode == "state":
         env = BatchedReach(num_envs, device)
     else:
