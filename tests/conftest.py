@@ -43,8 +43,8 @@ def pytest_addoption(parser):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Where the checks of tasks ran: resets of some of several environments are ManiSkill's business on a GPU."""
-    for where in ("stand-in", "physx_cuda"):
+    """Which simulation the checks of tasks ran on."""
+    for where, simulation in (("physx_cpu", "a batch on the CPU"), ("physx_cuda", "PhysX's GPU simulation")):
         reports = [
             sum(
                 where in report.nodeid and "test_task.py" in report.nodeid
@@ -53,9 +53,8 @@ def pytest_terminal_summary(terminalreporter):
             for k in ("passed", "failed", "error", "skipped")
         ]
         if any(reports):
-            name = "the CPU stand-in for PhysX's GPU simulation" if where == "stand-in" else "PhysX's GPU simulation"
             counts = "{} checks of tasks passed, {} failed, {} had an error, {} did not run".format(*reports)
-            terminalreporter.write_line(f"on {name}: {counts}")
+            terminalreporter.write_line(f"on {simulation}: {counts}")
 
 
 def pytest_runtest_setup(item):
@@ -78,9 +77,9 @@ def in_tmp(tmp_path, monkeypatch):
     return tmp_path
 
 
-# the values for a GPU, small
+# the values for a GPU, small; of the task only the registration is looked at
 SMALL = ppo.Args(
-    env_id="Reach", sim_backend="physx_cpu", num_envs=32, num_eval_envs=16, num_eval_episodes=24, num_steps=10,
+    sim_backend="physx_cpu", num_envs=32, num_eval_envs=16, num_eval_episodes=24, num_actors=1, num_steps=10,
     total_timesteps=32 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False,
 )  # fmt: skip
 
@@ -130,7 +129,7 @@ def same_weights(a, b):
     return all(torch.equal(a["agent"][k], b["agent"][k]) for k in a["agent"])
 
 
-WALL_CLOCK = {"time", "sps", "rollout_time", "update_time", "memory_mb", "workers_memory_mb", "gpu_memory_mb"}
+WALL_CLOCK = {"time", "sps", "rollout_time", "update_time", "memory_mb", "actors_memory_mb", "gpu_memory_mb"}
 
 
 def without_clock(rows):
@@ -203,7 +202,7 @@ def refused(arguments, capsys, script=ppo):
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A short run on the CPU pool, made once: its folder, and what it printed."""
+    """A short run with two actors on the CPU, made once: its folder, and what it printed."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
     folder.mkdir(exist_ok=True)
@@ -212,9 +211,9 @@ def trained(tmp_path_factory):
         if not (folder / "output.json").exists():
             shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own
             process = run_script(
-                "--exp-name", "small", "--num_envs", "2", "--num-eval-envs", "2", "--num_eval_episodes", "3",
-                "--num-steps", "40", "--total_timesteps", "400", "--eval_freq", "2", "--save_freq", "2",
-                "--no-capture_video", "--no-cuda",
+                "--exp-name", "small", "--num_envs", "4", "--num_actors", "2", "--num-eval-envs", "4",
+                "--num_eval_episodes", "6", "--num-steps", "20", "--total_timesteps", "400", "--eval_freq", "2",
+                "--save_freq", "2", "--no-capture_video", "--no-cuda",
                 cwd=folder, script=folder / "ppo.py",
             )  # fmt: skip
             assert process.returncode == 0, process.stderr

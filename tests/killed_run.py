@@ -19,7 +19,7 @@ import torch.utils.tensorboard  # noqa: F401
 import ppo
 
 ARGS = dict(
-    env_id="Reach", sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
+    sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_actors=1, num_eval_episodes=8, num_steps=10,
     total_timesteps=16 * 10 * 220, num_minibatches=2, update_epochs=1, eval_freq=25, capture_video=False, cuda=False,
     norm_obs=True, anneal_lr=True, checkpoint_freq=3, exact_resume=True,
 )  # fmt: skip

@@ -3,6 +3,8 @@ the command with real tasks."""
 
 import contextlib
 import errno
+import math
+import multiprocessing
 import os
 import re
 import resource
@@ -26,6 +28,7 @@ from conftest import (
     Stop,
     crash,
     read_metrics,
+    refused,
     run_script,
     same_run,
     same_weights,
@@ -338,6 +341,7 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, flag, how, c
     before = sorted(Path("runs").rglob("*"))
     arguments = {"--resume": ["--resume", path], "--checkpoint": ["--checkpoint", path, "--num_envs", 1],
                  "--evaluate": ["--evaluate", "--checkpoint", path, "--num_eval_envs", 1]}[flag]  # fmt: skip
+    arguments += ["--num_actors", 1]
     with pytest.raises(SystemExit) as error:
         ppo.main([*map(str, arguments), "--no-cuda", "--no-capture_video"])
     assert error.value.code == 2
@@ -355,14 +359,15 @@ def test_resume_refuses_other_flags_but_those_that_may_change(trained, in_tmp, c
         assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
     args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --save_freq 7 --track".split())
     assert (args.total_timesteps, args.eval_freq, args.save_freq, args.track) == (1000, 3, 7, True)
-    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (2, 40, 8, 1)
+    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 8, 1)
     assert ppo.find_run_dir(args) == Path("runs/x")
 
 
 # --- processes ---
 
-TINY = ("--num_envs", 4, "--num_eval_envs", 1, "--num_eval_episodes", 2, "--num_steps", 10, "--num_minibatches", 2,
-        "--eval_freq", 0, "--no-cuda", "--no-capture_video", "--exp-name", "x", "--total_timesteps", 10**6)  # fmt: skip
+TINY = ("--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 1, "--num_eval_episodes", 2, "--num_steps", 10,
+        "--num_minibatches", 2, "--eval_freq", 0, "--no-cuda", "--no-capture_video", "--exp-name", "x",
+        "--total_timesteps", 10**6)  # fmt: skip
 
 
 @pytest.fixture
@@ -435,15 +440,14 @@ def test_a_second_signal_ends_it_at_once(start):
     assert process.returncode == -signal.SIGINT
 
 
-def test_dead_worker_ends_the_run(start, tmp_path):
-    process, workers = start(*TINY)
-    workers[0].kill()
+def test_dead_actor_ends_the_run(start, tmp_path):
+    process, actors = start(*TINY)
+    assert len(actors) == 1
+    actors[0].kill()
     begun = time.monotonic()
     output, errors = process.communicate(timeout=30)
     assert process.returncode == 1 and time.monotonic() - begun < 10
-    assert re.search(
-        r"worker \d+ \(environments \d+ to \d+\) died with exit code -9 \(killed; out of memory\?\)", errors
-    )
+    assert "ppo.py: actor 1 died with exit code -9 (killed; out of memory?)" in errors
     assert "runs/x/last.pt is safe" in errors and "--resume runs/x" in errors and "Traceback" not in output + errors
     assert (
         ppo.load_checkpoint(tmp_path / "runs/x/last.pt")["iteration"]
@@ -451,17 +455,18 @@ def test_dead_worker_ends_the_run(start, tmp_path):
     )
 
 
-def test_dead_parent_ends_the_workers(start):
-    process, workers = start(*TINY)
-    assert len(workers) >= 2
+def test_dead_parent_ends_the_actors(start):
+    process, actors = start(*TINY)
+    assert len(actors) == 1
     process.kill()
     begun = time.monotonic()
-    _, alive = psutil.wait_procs(workers, timeout=10)
+    _, alive = psutil.wait_procs(actors, timeout=10)
     assert not alive and time.monotonic() - begun < 10
 
 
 FRAGILE = """
-import os, signal
+import multiprocessing
+
 from mani_skill.envs.tasks import PushCubeEnv
 from mani_skill.utils.registration import register_env
 
@@ -470,51 +475,107 @@ class Fragile(PushCubeEnv):
     steps = 0
 
     def compute_normalized_dense_reward(self, obs, action, info):
-        Fragile.steps += 1
-        if Fragile.steps == 60:
+        is_training = self.num_envs == 2  # of the 4 environments of 2 actors
+        Fragile.steps += is_training and (multiprocessing.parent_process() is None) == {in_main_process}
+        if is_training and Fragile.steps == 15:
             {fault}
         return super().compute_normalized_dense_reward(obs, action, info)
 """
 
 
-def test_error_of_a_task(in_tmp, monkeypatch, capfd):
-    Path("mistaken.py").write_text(FRAGILE.format(name="Mistaken", fault="raise ValueError('my own mistake')"))
-    monkeypatch.syspath_prepend(in_tmp)
-    flags = (*TINY, "--env_id", "mistaken:Mistaken-v1", "--num_eval_episodes", 1)  # which has 50 of the 60 steps
-    assert ppo.main([*map(str, flags)]) == 1
+def write_task(monkeypatch, name, **parts):
+    Path(f"{name.lower()}.py").write_text(FRAGILE.format(name=name, **parts))
+    monkeypatch.syspath_prepend(Path.cwd())
+    return "--env_id", f"{name.lower()}:{name}-v1"
+
+
+@pytest.mark.parametrize("in_main_process", [True, False])
+def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
+    """In actor 0, then in the other one: the same traceback, of the task, and nothing else."""
+    name = "Mistaken" + "Main" * in_main_process
+    task = write_task(monkeypatch, name, fault="raise ValueError('my own mistake')", in_main_process=in_main_process)
+    assert ppo.main([*map(str, (*TINY, *task))]) == 1
     errors = capfd.readouterr().err
-    assert re.search(r"(?s)worker \d .*failed:.*mistaken.py.*ValueError: my own mistake", errors), errors
+    assert re.search(rf"(?s){name.lower()}.py.*ValueError: my own mistake", errors), errors
+    assert ("actor 1 failed:" in errors) == (not in_main_process)
     assert "last.pt is safe" in errors and errors.count("Traceback") == 1
+    assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 1
 
 
-def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd):
-    """A cube at nowhere in one environment of the real simulator: one update is skipped, then training goes on."""
-    fault = "self.cube if 0 else self.obj.set_pose(Pose.create_from_pq(torch.full((1, 3), float('nan'))))"
-    source = "import torch\nfrom mani_skill.utils.structs import Pose\n" + FRAGILE.format(name="Exploding", fault=fault)
-    Path("exploding.py").write_text(source)
-    monkeypatch.syspath_prepend(in_tmp)
-    flags = (*TINY, "--env_id", "exploding:Exploding-v1", "--num_steps", 30, "--total_timesteps", 720)
+@pytest.mark.parametrize("in_main_process", [True, False])
+def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_process):
+    """A cube at nowhere in one environment of a real batch: that environment starts anew, the others go on, and one
+    update is skipped."""
+    fault = """
+            from mani_skill.utils.structs import Pose
+            poses = self.obj.pose.raw_pose.clone()
+            poses[1] = float("nan")
+            self.obj.set_pose(Pose.create(poses))
+            self.scene._gpu_apply_all()
+"""
+    task = write_task(monkeypatch, "Exploding" + "Main" * in_main_process, fault=fault, in_main_process=in_main_process)
+    flags = (*TINY, *task, "--num_steps", 30, "--total_timesteps", 4 * 120, "--no-partial_reset")
     assert ppo.main([*map(str, flags)]) == 0
-    skipped = [row["update_skipped"] for row in read_metrics(in_tmp / "runs/x") if row["kind"] == "train"]
-    assert len(skipped) == 6 and sum(skipped) == 1, capfd.readouterr()
+    rows = [row for row in read_metrics(in_tmp / "runs/x") if row["kind"] == "train"]
+    output = capfd.readouterr()
+    assert [row["update_skipped"] for row in rows] == [1, 0, 0, 0], output
+    assert f"in environments [{1 if in_main_process else 3}]: no update" in output.out
+    # ends after 50 and 100 steps; the one that began after 30 ends after 80
+    assert [row["num_episodes"] for row in rows] == [0, 3, 1, 3]
+    assert all(math.isfinite(row.get("return", 0)) for row in rows)
+
+
+def test_shared_memory_that_is_too_small_is_refused(in_tmp, monkeypatch, capsys):
+    """Where it would end in a "Bus error": before anything is written, and with the remedy. One actor needs none."""
+    flags = [*TINY, "--total_timesteps", 40, "--num_eval_episodes", 1, "--env_kwargs", '{"max_episode_steps": 5}']
+    usage, asked = shutil.disk_usage, []
+    tiny = lambda path: asked.append(str(path)) or usage("/")._replace(free=2**16)
+    monkeypatch.setattr(shutil, "disk_usage", tiny)
+    line = refused(flags, capsys)
+    assert re.search(r"needs \d+ MiB of shared memory, and 0 are free", line) and asked == ["/dev/shm"]
+    assert all(remedy in line for remedy in ("--shm-size", "fewer environments", "--num_actors 1"))
+    assert not multiprocessing.active_children(), "the other actor has ended"
+    assert ppo.main([*map(str, (*flags, "--num_actors", 1))]) == 0
+
+
+def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
+    """The same run resumed while it still goes on would write every row twice."""
+    lines = []
+    in_update(3, lambda: lines.append(refused(["--resume", "runs/run1", "--no-cuda"], capsys)))
+    metrics, *_ = train(**RUN)
+    assert lines == ["ppo.py: another process is writing to runs/run1: stop it first, or choose another --exp_name\n"]
+    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
+    ppo.open_metrics(Path("runs/run1")).close()  # it may be written to again
 
 
 @pytest.mark.slow
-def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch):
-    """The pool, and one environment in the process: stopped by kill -9 or a signal, the same as never stopped."""
+def test_many_environments_start(tmp_path):
+    """512 on a CPU, as a command for a GPU asks for."""
+    flags = ("--num_envs", 512, "--num_actors", 2, "--num_steps", 2, "--total_timesteps", 1024, "--exp-name", "x",
+             "--num_eval_envs", 2, "--num_eval_episodes", 2, "--no-cuda", "--no-capture_video")  # fmt: skip
+    process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
+    assert process.returncode == 0, process.stderr
+    assert [row["kind"] for row in read_metrics(tmp_path / "runs/x")] == ["eval", "train", "eval"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "num_envs, num_actors, signum", [(5, 2, signal.SIGTERM), (3, 1, signal.SIGKILL), (2, 2, signal.SIGKILL)]
+)
+def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch, num_envs, num_actors, signum):
+    """Two actors, one, and ManiSkill's own simulation of single environments: stopped by kill -9 or a signal, the same
+    to the last bit as never stopped."""
     monkeypatch.chdir(tmp_path)
-    for num_envs, signum in ((3, signal.SIGTERM), (1, signal.SIGKILL)):
-        flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_steps", 20,
-                 "--total_timesteps", 10 * 20 * num_envs, "--eval_freq", 7, "--num_eval_episodes", 1,
-                 "--env_kwargs", '{"max_episode_steps": 15}']  # fmt: skip
-        assert ppo.main([*map(str, flags), "--exp-name", "whole"]) == 0
-        process, _ = start(*flags, wait_for_rows=6)
-        process.send_signal(signum)
-        process.communicate(timeout=60)
-        assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "it was stopped before its end"
-        assert ppo.main(["--resume", "runs/x"]) == 0
-        assert same_run(tmp_path / "runs/whole", tmp_path / "runs/x")
-        shutil.rmtree(tmp_path / "runs")
+    flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_actors", num_actors,
+             "--num_steps", 20, "--total_timesteps", 10 * 20 * num_envs, "--eval_freq", 7, "--num_eval_episodes", 3,
+             "--num_eval_envs", 3, "--env_kwargs", '{"max_episode_steps": 15}']  # fmt: skip
+    assert ppo.main([*map(str, flags), "--exp-name", "whole"]) == 0
+    process, _ = start(*flags, wait_for_rows=6)
+    process.send_signal(signum)
+    process.communicate(timeout=60)
+    assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "it was stopped before its end"
+    assert ppo.main(["--resume", "runs/x"]) == 0
+    assert same_run(tmp_path / "runs/whole", tmp_path / "runs/x")
 
 
 @pytest.mark.slow
@@ -531,16 +592,18 @@ def test_kill_at_random_moments(tmp_path):
 
 
 @pytest.mark.slow
-def test_memory_is_flat(tmp_path):
-    """Over 2,000 iterations, of the main process and of the workers."""
-    flags = ("--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
-             "--num_envs", 2, "--num_eval_envs", 1, "--num_eval_episodes", 1, "--num_steps", 2, "--num_minibatches", 1,
-             "--update_epochs", 1, "--eval_freq", 200, "--checkpoint_freq", 20, "--no-capture_video", "--no-cuda",
-             "--exp-name", "x", "--total_timesteps", 8_000)  # fmt: skip
+@pytest.mark.parametrize("num_iterations, flags", [(2000, ()), (300, ("--exact_resume", "--checkpoint_freq", 2))])
+def test_memory_is_flat(tmp_path, num_iterations, flags):
+    """Over 2,000 iterations, of the main process and of the other actor; and over 150 times that scenes are rebuilt."""
+    flags = (*flags, "--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
+             "--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 2,
+             "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-capture_video", "--no-cuda",
+             "--exp-name", "x", "--total_timesteps", 8 * num_iterations)  # fmt: skip
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
     assert process.returncode == 0, process.stderr
     rows = [row for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "train"]
-    assert len(rows) == 2000
-    for key in ("memory_mb", "workers_memory_mb"):
-        early, late = [sum(row[key] for row in part) / len(part) for part in (rows[500:600], rows[-100:])]
+    assert len(rows) == num_iterations
+    for key in ("memory_mb", "actors_memory_mb"):
+        quarter = num_iterations // 4
+        early, late = [sum(row[key] for row in part) / len(part) for part in (rows[quarter:][:50], rows[-50:])]
         assert late - early < 3, (key, early, late)

@@ -9,7 +9,6 @@ from dataclasses import replace
 import batched_env
 import pytest
 import torch
-from batched_physx import batched_physx
 from conftest import SMALL, box, read_metrics, same_weights
 
 import ppo
@@ -54,8 +53,9 @@ def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
     agent.actor_mean.weight.data *= 100
     results = []
     for num_envs in (1, 5, 16):
-        envs = batched_env.make_envs(replace(SMALL, num_eval_envs=num_envs), None, True, device)
-        results.append(ppo.evaluate(agent, envs, num_episodes=11, seed=100, num_steps=20, device=device))
+        for separately in (False, True):
+            envs = batched_env.make_envs(SMALL, num_envs, 0, evaluation=True, device=device)
+            results.append(ppo.evaluate(agent, envs, 11, seed=100, num_steps=20, separately=separately))
     for result in results:
         assert set(result) == {"return", "episode_len", "success_once", "success_at_end", "fail_once", "fail_at_end"}
         for key, values in result.items():
@@ -68,8 +68,8 @@ def test_evaluation_with_early_ends(train, device):
     """eval_partial_reset: an episode counts up to its first end."""
     agent = ppo.Agent(box(4), box(2), SMALL).to(device)
     agent.get_action = lambda obs: ((obs[:, 2:] - obs[:, :2]) / 0.3).clamp(-1, 1)  # straight to the goal
-    envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), None, True, device)
-    result = ppo.evaluate(agent, envs, 16, 0, 20, device)
+    envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), 16, 0, evaluation=True, device=device)
+    result = ppo.evaluate(agent, envs, 16, seed=0, num_steps=20)
     start = envs.base_env.reset(seed=list(range(16)))[0]
     needed = ((start[:, 2:] - start[:, :2]).abs().amax(1) / 0.3 - 0.34).ceil().clamp(min=1).cpu()
     assert result["success_at_end"].all() and result["success_once"].all()
@@ -164,15 +164,14 @@ def test_anneal_lr_reaches_zero(train):
     assert rates == pytest.approx([4e-4, 3e-4, 2e-4, 1e-4])
 
 
-def test_gpu_simulation(in_tmp, monkeypatch):
-    """The branch for `physx_cuda`, and ManiSkill's own code for it, on the stand-in for PhysX's GPU simulation."""
-    monkeypatch.setattr(ppo, "choose_device", lambda args: torch.device("cpu"))
+def test_a_real_task(in_tmp):
+    """Of ManiSkill, in a batch in this process: the episodes that end are counted, and evaluations are written down."""
     args = ppo.Args(
-        sim_backend="physx_cuda", num_envs=4, num_steps=15, total_timesteps=120, num_minibatches=4, num_eval_envs=3,
-        num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True,
+        sim_backend="physx_cpu", num_envs=4, num_actors=1, num_steps=15, total_timesteps=120, num_minibatches=4,
+        num_eval_envs=3, num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True, cuda=False,
         env_kwargs='{"max_episode_steps": 10}',
     )  # fmt: skip
-    with batched_physx(), contextlib.ExitStack() as closing:
+    with contextlib.ExitStack() as closing:
         assert ppo.train(args, closing) == 0
     rows = read_metrics(in_tmp / "runs/x")
     assert [row["num_episodes"] for row in rows] == [5, 4, 8, 5] and rows[-1]["kind"] == "eval"
