@@ -293,3 +293,135 @@ def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
     ended = [step for step in spy.steps if "reset_obs" in step]
     assert all((step["obs"] != step["reset_obs"]).any(1).all() for step in ended)
     envs.close()
+
+
+# --- the environments of several actors ---
+
+TWO = replace(PUSH, num_envs=4, num_actors=2, num_eval_envs=4, env_kwargs="{}")
+
+
+def noise_alone(obs):
+    """Stands in for the policy: what is stored as the action is the noise itself."""
+    return torch.randn(len(obs), 8), torch.zeros(len(obs))
+
+
+@pytest.fixture(scope="module")
+def actors():
+    """Both actors of a run, and a spy on the seeds that each gives its environments."""
+    actors = [ppo.Actor(TWO, index) for index in (0, 1)]
+    for actor in actors:
+        actor.seeds, reset = [], actor.envs.reset
+
+        def spy_reset(seed=None, options=None, actor=actor, reset=reset):
+            actor.seeds.append(seed)
+            return reset(seed=seed, options=options)
+
+        actor.envs.reset = spy_reset
+    yield actors
+    for actor in actors:
+        actor.close()
+
+
+def noise_of(actor, iteration, seed=TWO.seed, restart=False):
+    obs_size = actor.envs.single_observation_space.shape[0]
+    storage, actor.args = make_storage(TWO, obs_size, 8), replace(TWO, seed=seed)
+    actor.connect(make_agent(box(obs_size), box(8), TWO), storage, noise_alone)
+    actor.rollout(iteration, restart, False)
+    actor.args = TWO
+    return storage["actions"][:, actor.env_idx.start : actor.env_idx.stop]
+
+
+def test_an_actor_writes_its_own_columns(actors):
+    agent = make_agent(actors[0].envs.single_observation_space, actors[0].envs.single_action_space, TWO)
+    storage = make_storage(TWO, len(agent.obs_mean), 8)
+    empty = {k: v.clone() for k, v in storage.items()}
+    for actor, own, others in zip(actors, (slice(0, 2), slice(2, 4)), (slice(2, 4), slice(0, 2))):
+        for k, v in storage.items():
+            v.copy_(empty[k])
+        actor.connect(agent, storage)
+        actor.rollout(0, True, False)
+        for name, x in storage.items():
+            assert x[:, own].isfinite().all() and x[:, others].isnan().all(), name
+
+
+def test_noise_follows_from_seed_iteration_and_actor(actors):
+    for actor in actors:
+        noise_of(actor, 0, restart=True)
+    usual = [noise_of(actor, 4) for actor in actors]
+    again = [noise_of(actor, 4) for actor in actors]
+    assert all(map(torch.equal, usual, again))
+    others = [noise_of(actor, 4, seed=12) for actor in actors] + [noise_of(actor, 5) for actor in actors]
+    numbers = torch.cat([x.flatten() for x in usual + others])
+    assert len(numbers.unique()) == len(numbers), "no number is drawn twice"
+
+
+def test_episodes_start_anew_from_seeds_of_their_own_where_asked(actors):
+    """Training's seeds are no evaluation's, and differ between environments, iterations and seeds of runs."""
+    all_seeds = []
+    for actor in actors:
+        actor.seeds.clear()
+        for iteration, seed in ((0, 11), (3, 11), (0, 12)):
+            noise_of(actor, iteration, seed, restart=True)
+        assert len(actor.seeds) == 3, "no episode has ended, so nothing else was reset"
+        all_seeds += sum(actor.seeds, [])
+        noise_of(actor, 0, restart=True)
+        assert actor.seeds.pop() == actor.seeds[0]
+        noise_of(actor, 1)
+        assert len(actor.seeds) == 3, "episodes go on in the next iteration"
+    assert len(set(all_seeds)) == len(all_seeds) == 12
+    assert all(2**31 <= seed < 2**32 for seed in all_seeds)
+
+
+def test_episodes_go_on_from_one_iteration_to_the_next(actors):
+    actor = actors[1]
+    noise_of(actor, 0, restart=True)
+    first = actor.storage["obs"][0].clone()
+    for number in range(1, 4):
+        after = actor.obs.clone()
+        noise_of(actor, number)
+        assert torch.equal(actor.storage["obs"][0], after) and not torch.equal(after, first)
+        assert actor.envs.base_env.elapsed_steps.tolist() == [TWO.num_steps * (number + 1)] * 2
+    noise_of(actor, 0, restart=True)
+    torch.testing.assert_close(actor.storage["obs"][0], first, rtol=1e-4, atol=1e-4)
+
+
+PEG = replace(TWO, env_id="PegInsertionSide-v1")
+
+
+def sizes(envs):
+    return envs.base_env.peg_half_sizes[:, :2].flatten().tolist()
+
+
+def sizes_of(args, index):
+    actor = ppo.Actor(args, index)
+    training, evaluation = sizes(actor.envs), sizes(actor.eval_envs)
+    actor.close()
+    return training, evaluation
+
+
+def test_objects_follow_from_the_seed_and_the_actor():
+    """A task that varies its objects builds others for each actor and each seed; evaluation's have a seed apart."""
+    (training, evaluation), (of_actor_1, evaluation_1) = sizes_of(PEG, 0), sizes_of(PEG, 1)
+    of_seed_12, same_evaluation = sizes_of(replace(PEG, seed=12), 0)
+    same, other_evaluation = sizes_of(replace(PEG, eval_seed=50), 0)
+    assert same == training and same_evaluation == evaluation
+    numbers = training + of_actor_1 + of_seed_12 + evaluation + evaluation_1 + other_evaluation
+    assert len(set(numbers)) == len(numbers)
+
+
+def test_evaluation_builds_the_objects_of_its_seeds():
+    """Those of episode k are those of ManiSkill's single environment with seed eval_seed + k."""
+    args = replace(PEG, eval_seed=7, num_actors=1, env_kwargs='{"max_episode_steps": 1}')
+    envs = ppo.make_envs(args, 2, 1234, evaluation=True)
+    agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
+    found, step = [], envs.step
+    envs.step = lambda action: found.extend(envs.base_env.peg_half_sizes.tolist()) or step(action)
+    ppo.evaluate(agent, envs, 4, 7, 1, ppo.rebuilding(args), separately=True)
+    single = gym.make(args.env_id, num_envs=1, sim_backend="physx_cpu", render_backend="none", obs_mode="state")
+    wanted = []
+    for seed in range(7, 11):
+        single.reset(seed=seed, options=dict(reconfigure=True))
+        wanted += single.unwrapped.peg_half_sizes.tolist()
+    assert found == wanted
+    envs.close()
+    single.close()
