@@ -115,9 +115,10 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import parse_camera_configs, update_camera_configs_from_dict
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
+from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Articulation, Link
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
@@ -754,7 +755,7 @@ class BatchedPhysx:
             positions = joints_at[i] + torch.arange(articulation.dof)
             self.joint_columns[0, i, : articulation.dof] = positions
             self.joint_columns[1, i, : articulation.dof] = positions + articulation.dof
-        self.num_packed_poses, self.moved = None, True
+        self.num_packed_poses, self.moved, self.contacts = None, True, None
         self.gpu_fetch_rigid_dynamic_data()
         self.gpu_fetch_articulation_link_pose()
         self.gpu_fetch_articulation_qpos()
@@ -765,7 +766,7 @@ class BatchedPhysx:
         self.gpu_apply_articulation_target_velocity()
         for system in self.systems:
             system.step()
-        self.moved = True
+        self.moved, self.contacts = True, None
 
     # --- from the simulation to the tensors ---
 
@@ -773,7 +774,7 @@ class BatchedPhysx:
         """Read the whole state of all scenes, unless nothing has moved since."""
         if not self.moved:
             return
-        self.moved, self.contacts = False, None
+        self.moved = False
         self.cuda_articulation_qacc.outdated = True
         packed = bytearray().join([*(system.pack() for system in self.systems), bytes(4)])
         self.packed = torch.frombuffer(packed, dtype=torch.float32)
@@ -809,8 +810,9 @@ class BatchedPhysx:
         self.cuda_rigid_body_data.fetch(self.root_rows, slice(7, 13), self.packed[self.root_columns])
 
     def read_velocities(self, links: list) -> None:
-        rows = [self.row[link] for link in links if not link.is_root]
-        if rows:
+        links = [link for link in links if not link.is_root]
+        if links:
+            rows = [self.row[link] for link in links]
             velocities = np.array([[*link.linear_velocity, *link.angular_velocity] for link in links])
             self.cuda_rigid_body_data.data[rows, 7:] = torch.from_numpy(velocities).float()
 
@@ -903,33 +905,25 @@ class BatchedPhysx:
 
     # --- contacts: asked of the simulation only where a task asks ---
 
-    def get_contacts(self) -> list:
-        if self.contacts is None:
-            self.contacts = [contact for system in self.systems for contact in system.get_contacts()]
-        return self.contacts
-
-    def gpu_create_contact_pair_impulse_query(self, pairs: list[tuple]):
-        return SimpleNamespace(rows={pair: i for i, pair in enumerate(pairs)}, cuda_impulses=Array(len(pairs), 3))
-
-    def gpu_query_contact_pair_impulses(self, query) -> None:
-        """Impulse on the first body of each pair from the second."""
-        impulses = query.cuda_impulses.data.zero_()
-        for contact in self.get_contacts():
-            first, second = contact.bodies
-            if (first, second) in query.rows:
-                impulses[query.rows[first, second]] += total_impulse(contact)
-            elif (second, first) in query.rows:
-                impulses[query.rows[second, first]] -= total_impulse(contact)
-
     def gpu_create_contact_body_impulse_query(self, bodies: list):
-        return SimpleNamespace(rows={body: i for i, body in enumerate(bodies)}, cuda_impulses=Array(len(bodies), 3))
+        """For the net impulse on each of these bodies or, of each pair, on the first body from the second."""
+        return SimpleNamespace(bodies=bodies, cuda_impulses=Array(len(bodies), 3))
+
+    gpu_create_contact_pair_impulse_query = gpu_create_contact_body_impulse_query
 
     def gpu_query_contact_body_impulses(self, query) -> None:
-        impulses = query.cuda_impulses.data.zero_()
-        for contact in self.get_contacts():
-            for body, sign in zip(contact.bodies, (1, -1)):
-                if body in query.rows:
-                    impulses[query.rows[body]] += sign * total_impulse(contact)
+        if self.contacts is None:
+            self.contacts = defaultdict(list)
+            for contact in [contact for system in self.systems for contact in system.get_contacts()]:
+                a, b = contact.bodies
+                for key, sign in ((a, 1), (b, -1), ((a, b), 1), ((b, a), -1)):
+                    self.contacts[key].append((contact, sign))
+        for impulse, key in zip(query.cuda_impulses.data.zero_(), query.bodies):
+            for contact, sign in self.contacts.get(key, ()):
+                total = np.sum([point.impulse for point in contact.points], axis=0, dtype=np.float32)
+                impulse += sign * torch.from_numpy(total)
+
+    gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
 
     # --- what a CPU simulation need not do ---
 
@@ -941,10 +935,6 @@ class BatchedPhysx:
 
     gpu_fetch_articulation_qacc = gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
     gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
-
-
-def total_impulse(contact) -> torch.Tensor:
-    return torch.from_numpy(np.sum([point.impulse for point in contact.points], axis=0, dtype=np.float32))
 
 
 class BatchedRenderer:
@@ -970,7 +960,7 @@ class BatchedCamera:
             camera.take_picture()
 
     def get_picture_cuda(self, name: str) -> SimpleNamespace:
-        pictures = torch.from_numpy(np.stack([camera.get_picture(name) for camera in self.cameras]))
+        pictures = common.to_tensor(np.stack([camera.get_picture(name) for camera in self.cameras]))
         return SimpleNamespace(torch=lambda: pictures)
 
 
@@ -984,6 +974,7 @@ def batch_on_cpu() -> None:
     setup_scene, reset = sapien_env.BaseEnv._setup_scene, sapien_env.BaseEnv.reset
     body_data = PhysxRigidBodyComponentStruct._body_data
     set_action, compute_ik = PDEEPosController.set_action, Kinematics.compute_ik
+    build_physx_component = ActorBuilder.build_physx_component
 
     def setup_batch(env):
         if env.num_envs == 1 or env._sim_device.is_cuda():
@@ -1004,10 +995,28 @@ def batch_on_cpu() -> None:
             seed = [env.build_seed + i for i in range(env.num_envs)]
         return reset(env, seed=seed, options=options)
 
+    def build_with_planes(builder, *args, **kwargs):
+        """On a GPU all environments share the ground that the first of them is given."""
+        if is_batch(builder.scene):
+            builder._plane_collision_poses.clear()
+        return build_physx_component(builder, *args, **kwargs)
+
     def body_data_with_velocities(struct):
         if isinstance(struct, Link) and is_batch(struct.scene):
             struct.px.read_velocities(struct._objs)
         return body_data.fget(struct)
+
+    def keep_awake(name):
+        """In each step, drive targets that are set keep the robot of a single environment awake, unchanged ones too."""
+        set_targets = getattr(Articulation, name)
+
+        def set_and_wake(articulation, *args, **kwargs):
+            set_targets(articulation, *args, **kwargs)
+            if is_batch(articulation.scene):
+                for robot in articulation._objs:
+                    robot.root.wake_up()
+
+        setattr(Articulation, name, set_and_wake)
 
     def set_action_by_pose(controller, action):
         """The solver for one environment wants a pose to reach, not a change of pose."""
@@ -1044,6 +1053,9 @@ def batch_on_cpu() -> None:
     sapien_env.BaseEnv.build_seed = 2022  # ManiSkill's; a run sets its own, so that its processes build other objects
     PhysxRigidBodyComponentStruct._body_data = property(body_data_with_velocities)
     PDEEPosController.set_action, Kinematics.compute_ik = set_action_by_pose, compute_ik_by_row
+    ActorBuilder.build_physx_component = build_with_planes
+    keep_awake("set_joint_drive_targets")
+    keep_awake("set_joint_drive_velocity_targets")
 
 
 batch_on_cpu()
