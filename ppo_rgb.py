@@ -113,8 +113,8 @@ from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.render.utils import can_render
-from mani_skill.utils import common
 from mani_skill.sensors.camera import parse_camera_configs, update_camera_configs_from_dict
+from mani_skill.utils import common
 from mani_skill.utils.assets import expand_data_group_into_individual_data_source_ids, is_data_source_downloaded
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
