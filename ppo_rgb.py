@@ -1141,7 +1141,7 @@ def check_shared_memory(needed: int) -> None:
     """Refuse what does not fit into the memory that processes share: it would end in a bare 'Bus error'."""
     free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else math.inf
     if needed > free:
-        fail(f"{needed / 2**20:,.0f} MiB of shared memory are needed, and {free / 2**20:,.0f} are free: give the "
+        fail(f"this run needs {needed / 2**20:,.0f} MiB of shared memory, and {free / 2**20:,.0f} are free: give the "
              "container more (--shm-size), or use fewer environments or steps, or --num_actors 1")  # fmt: skip
 
 

@@ -6,6 +6,7 @@ It needs nothing but Python: what is not installed, broken, or crashes is a row 
 tried in a process of its own."""
 
 import importlib.metadata
+import math
 import os
 import platform
 import shutil
@@ -109,6 +110,23 @@ def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> None:
         print(f"{'':<35}-> {remedy}")
 
 
+def show_shared_memory(cores: int) -> None:
+    """With CPU simulation the process of each core writes what it sees there; with images that may be too much."""
+    free = shutil.disk_usage("/dev/shm").free
+    num_envs = 16 * cores
+    steps = num_envs * max(5, 1600 // num_envs)
+    side = math.isqrt(max(0, free - 16 * 2**20) // (3 * steps))  # the rest is for all that is no image
+    found = f"{free / 2**20:,.0f} MiB free: "
+    if cores == 1:
+        found += "one core needs none"
+    elif free < 16 * 2**20:
+        found += "hardly enough for states, too little for images"
+    else:
+        found += f"enough for states, and for colour images of up to {side}x{side} ({steps:,} steps an iteration)"
+    remedy = "--shm-size=1g for the container; without it, fewer steps or --num_actors 1, for ppo_rgb.py on a CPU"
+    row(cores == 1 or side >= 128, "shared memory", found, remedy)
+
+
 def main() -> None:
     remedy = "use Python 3.10, 3.11 or 3.12: mani-skill's dependencies have no other"
     row((3, 10) <= sys.version_info[:2] <= (3, 12), "Python", platform.python_version(), remedy)
@@ -127,6 +145,8 @@ def main() -> None:
     limit = read("/sys/fs/cgroup/memory.max")
     memory = min(memory, int(limit)) if limit.isdigit() else memory
     row(None, "memory", f"{memory / 2**30:.0f} GiB")
+    if Path("/dev/shm").exists():
+        show_shared_memory(cores)
     row(None, "free disk here", f"{shutil.disk_usage('.').free / 2**30:.0f} GiB")
 
     driver = read("/proc/driver/nvidia/version").splitlines()
@@ -153,8 +173,8 @@ def main() -> None:
     print("\nwhat therefore works (tried):")
     gpu = cuda and libcuda and physx
     for name, possible, num_envs, sim_backend, obs_mode, render_backend in (
-        ("state, CPU simulation", True, 1, "physx_cpu", "state", "none"),
-        ("images, CPU simulation", vulkan, 1, "physx_cpu", "rgb", "gpu"),
+        ("state, CPU simulation", True, 2, "physx_cpu", "state", "none"),
+        ("images, CPU simulation", vulkan, 2, "physx_cpu", "rgb", "gpu"),
         ("state, GPU simulation", gpu, 2, "physx_cuda", "state", "none"),
         ("images, GPU simulation", gpu and vulkan, 2, "physx_cuda", "rgb", "gpu"),
     ):

@@ -1,11 +1,16 @@
 """examples/check_machine.py: true where all is well, and no crash where nothing is."""
 
 import os
+import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from conftest import NO_VULKAN, ROOT
+
+import ppo_rgb
+from examples import check_machine as check_machine_script
 
 
 def check_machine(**environment):
@@ -31,6 +36,32 @@ def test_with_vulkan():
     table = check_machine()
     assert "ok       Vulkan" in table
     assert "ok       images, CPU simulation    PushCube-v1 was built and stepped" in table
+
+
+def test_shared_memory(monkeypatch, capsys):
+    """What it says suffices is what ppo_rgb.py asks for."""
+    free = lambda mebibytes: monkeypatch.setattr(
+        shutil, "disk_usage", lambda path: SimpleNamespace(free=mebibytes * 2**20)
+    )
+    for mebibytes, cores, expected in (
+        (
+            64,
+            2,
+            "missing  shared memory             64 MiB free: enough for states, and for colour images of up to 102x102",
+        ),
+        (8, 2, "missing  shared memory             8 MiB free: hardly enough for states"),
+        (8, 1, "ok       shared memory             8 MiB free: one core needs none"),
+        (1024, 2, "ok       shared memory             1,024 MiB free: enough for states, and for colour images"),
+    ):
+        free(mebibytes)
+        check_machine_script.show_shared_memory(cores)
+        output = capsys.readouterr().out
+        assert output.startswith(expected) and ("-> --shm-size" in output) == expected.startswith("missing")
+    args = ppo_rgb.Args(num_envs=32, num_steps=50)
+    free(64)
+    ppo_rgb.check_shared_memory(ppo_rgb.image_bytes(args, [(102, 102)]) + 16 * 2**20)
+    with pytest.raises(SystemExit):
+        ppo_rgb.check_shared_memory(ppo_rgb.image_bytes(args, [(103, 103)]) + 16 * 2**20)
 
 
 def test_where_all_is_broken(tmp_path):
