@@ -4,6 +4,8 @@ Like a CUDA graph it records, once, the operations that a function makes, and re
 memory, without the function: numbers that Python held at the recording are frozen, tensors are where they were. Like a
 capture it refuses what makes the host look at a number."""
 
+import copy
+
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -36,16 +38,20 @@ class Recording(TorchDispatchMode):
 
 def as_recorded_graph(function, enabled):
     """In place of `as_cuda_graph`: with one call before the recording, which is a call too."""
-    recording, num_calls, result = Recording(), 0, None
+    recording, num_calls, result, held = Recording(), 0, None, ()
 
-    def launch():
-        nonlocal num_calls, result
+    def launch(*obs):
+        nonlocal num_calls, result, held
         num_calls += 1
         if num_calls == 1:
-            return function()
+            held = copy.deepcopy(obs)
+        for old, new in zip(tree_leaves(held), tree_leaves(obs), strict=True):
+            old.copy_(new)
+        if num_calls == 1:
+            return function(*held)
         if num_calls == 2:
             with recording:
-                result = function()
+                result = function(*held)
         else:
             recording.replay()
         return result

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, read_metrics, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, read_metrics, refused, run_script, same_weights
 
 import ppo
 
@@ -27,13 +27,13 @@ def test_run_folder(trained):
     assert [row["iteration"] for row in train_rows] == [1, 2, 3, 4, 5]
     assert [row["global_step"] for row in evaluations] == [0, 160, 320, 400]
     for row in evaluations:
-        assert row["num_episodes"] == 3 and row["episode_len"] == 50
+        assert row["num_episodes"] == 6 and row["episode_len"] == 50
         assert 0 <= row["success_at_end"] <= row["success_once"] <= 1 and row["return"] > 0
     for row in train_rows:
         assert row["sps"] > 0 and all(math.isfinite(v) for v in row.values() if not isinstance(v, str))
     about = json.loads((folder / "args.json").read_text())
-    assert about["args"]["num_envs"] == 2 and about["args"]["sim_backend"] == "physx_cpu"
-    assert about["versions"].keys() >= {"mani-skill", "torch", "sapien"} and "--num-steps 40" in about["command"]
+    assert about["args"]["num_envs"] == 4 and about["args"]["sim_backend"] == "physx_cpu"
+    assert about["versions"].keys() >= {"mani-skill", "torch", "sapien"} and "--num-steps 20" in about["command"]
     assert (folder / "learning_curve.png").stat().st_size > 5000
     assert list(folder.glob("events.out.tfevents.*"))
     names = {"best.pt", "last.pt", "iteration_2.pt", "iteration_4.pt"}
@@ -60,7 +60,7 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
     folder, *_ = trained
     command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video")
     monkeypatch.chdir(tmp_path)
-    assert ppo.main([*map(str, command), "--num_eval_episodes", "5", "--eval-seed", "100"]) == 0
+    assert ppo.main([*map(str, command), "--num_actors", "1", "--num_eval_episodes", "5", "--eval-seed", "100"]) == 0
     output = capsys.readouterr().out
     results = json.loads((folder / "eval.json").read_text())
     assert results["num_episodes"] == 5 and results["eval_seed"] == 100
@@ -69,7 +69,7 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
         assert low <= results[key] <= high and f"{results[key]:.3f}" in output
     assert not list(tmp_path.iterdir()), "nothing is written but beside the checkpoint"
     # the last evaluation of the training run, once more; PhysX remembers contacts of the episodes before
-    assert ppo.main([*map(str, command), "--num_eval_episodes", "3", "--num_eval_envs", "1"]) == 0
+    assert ppo.main([*map(str, command), "--num_actors", "2", "--num_eval_envs", "2"]) == 0
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     results = json.loads((folder / "eval.json").read_text())
     assert {k: results[k] for k in ("return", "success_once")} == pytest.approx(
@@ -118,14 +118,17 @@ def test_commands_for_the_peers_scripts_parse(trained):
 
 def test_defaults_by_backend(monkeypatch):
     args = ppo.parse_args(["--no-cuda"])
-    assert args.sim_backend == "physx_cpu" and args.num_envs == 8 * ppo.num_cores()
+    cores = ppo.num_cores()
+    assert (args.sim_backend, args.num_envs, args.num_eval_envs) == ("physx_cpu", 16 * cores, 16 * cores)
+    assert args.num_actors == cores and args.num_steps == max(5, 1600 // args.num_envs)
     assert args.batch_size >= args.num_minibatches and args.num_iterations > 10
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
-    assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations > 10
+    assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations > 10 and args.num_steps == 5
+    assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     args = ppo.parse_args([])
     assert args.sim_backend == "physx_cuda" and args.exp_name.startswith("PushCube-v1__ppo__1__")
-    assert args == replace(ppo.Args(), sim_backend="physx_cuda", num_steps=50, exp_name=args.exp_name)
+    assert args == replace(ppo.Args(), sim_backend="physx_cuda", num_steps=50, num_actors=1, exp_name=args.exp_name)
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
@@ -154,7 +157,7 @@ def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
 def test_other_kinds_of_task(tmp_path):
     """Dict action spaces, tasks without success, other robots, sparse reward: built and trained without Vulkan."""
     env_ids = ("TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1")
-    flags = [*map(str, TINY), "--env_kwargs", '{"max_episode_steps": 10}']
+    flags = [*map(str, TINY), "--num_envs", "2", "--num_actors", "1", "--env_kwargs", '{"max_episode_steps": 10}']
     (tmp_path / "all.py").write_text(f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
@@ -217,14 +220,41 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
 
 
 @pytest.mark.slow
-def test_weights_do_not_depend_on_evaluation_with_the_pool(in_tmp):
-    """The same through real tasks: training in the pool, evaluation in the process, where it could disturb."""
+def test_weights_do_not_depend_on_evaluation_with_real_tasks(in_tmp):
+    """Evaluation and training share two processes."""
     for freq in (1, 0):
-        flags = (*TINY, "--num_envs", 4, "--total_timesteps", 160, "--exp-name", freq, "--eval_freq", freq,
-                 "--num_eval_episodes", 1, "--env_kwargs", '{"max_episode_steps": 15}')  # fmt: skip
+        flags = (*TINY, "--num_envs", 4, "--num_actors", 2, "--total_timesteps", 160, "--exp-name", freq,
+                 "--eval_freq", freq, "--env_kwargs", '{"max_episode_steps": 15}')  # fmt: skip
         assert ppo.main([*map(str, flags), "--no-capture_video"]) == 0
     a, b = [ppo.load_checkpoint(f"runs/{freq}/last.pt") for freq in (1, 0)]
     assert same_weights(a, b)
+
+
+CANNOT_RESET_SOME = """
+import torch
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Pose
+
+@register_env("Whole-v1", max_episode_steps=10)
+class Whole(PushCubeEnv):
+    def _initialize_episode(self, env_idx, options):
+        super()._initialize_episode(env_idx, options)
+        self.obj.set_pose(Pose.create_from_pq(torch.rand(self.num_envs, 3)))
+"""
+
+
+def test_task_that_cannot_reset_some_environments(in_tmp, monkeypatch, capsys):
+    """Is refused in one line, and both remedies that the line names work."""
+    (in_tmp / "whole.py").write_text(CANNOT_RESET_SOME)
+    monkeypatch.syspath_prepend(in_tmp)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    flags = (*TINY, "--num_envs", 2, "--num_eval_envs", 2, "--env_id", "whole:Whole-v1", "--no-capture_video")
+    line = refused((*flags, "--num_actors", 1), capsys)
+    assert "Whole-v1 cannot reset some" in line and "--num_actors 2" in line and "--no-partial_reset" in line
+    for n, remedy in enumerate((("--num_actors", 2), ("--num_actors", 1, "--no-partial_reset"))):
+        assert ppo.main([*map(str, (*flags, *remedy, "--exp-name", n))]) == 0
+        assert [row["num_episodes"] for row in read_metrics(in_tmp / f"runs/{n}")] == [2, 4, 2]
 
 
 def frames(path):
@@ -235,20 +265,23 @@ def frames(path):
 
 @pytest.mark.render
 def test_videos_and_trajectories(in_tmp, capfd):
-    flags = (*TINY, "--env_kwargs", '{"max_episode_steps": 8}', "--save_trajectory", "--save_train_video_freq", 1,
-             "--num_eval_envs", 2)  # fmt: skip
+    short = ("--env_kwargs", '{"max_episode_steps": 8}')
+    flags = (*TINY, *short, "--save_trajectory", "--save_train_video_freq", 1, "--num_envs", 2, "--num_actors", 2,
+             "--num_steps", 10, "--num_eval_envs", 4, "--num_eval_episodes", 4)  # fmt: skip
     assert ppo.main([*map(str, flags)]) == 0 and capfd.readouterr().err == ""
     run = in_tmp / "runs/tiny"
     videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))
     assert videos == ["step_000000000.mp4", "step_000000040.mp4"]
-    assert list((run / "train_videos").glob("*.mp4"))
+    assert sorted(path.name for path in (run / "train_videos").iterdir()) == [
+        "step_000000020.mp4", "step_000000040.mp4"
+    ]  # fmt: skip
     images = frames(run / "videos" / videos[0])
     assert 8 <= len(images) <= 10 and images.std() > 10, "a filmed scene is not of one colour"
-    # ManiSkill's own tool replays what was recorded, to the same states
+    # one file an actor, with its part of the episodes; ManiSkill's own tool replays them to the same states
     files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
     assert files == [f"trajectory_{i}.{suffix}" for i in range(2) for suffix in ("h5", "json")]
     episodes = json.loads((run / "videos/trajectory_1.json").read_text())["episodes"]
-    assert [(e["elapsed_steps"], e["episode_seed"]) for e in episodes] == [(8, 1)] * 2
+    assert [(e["elapsed_steps"], e["episode_seed"]) for e in episodes] == [(8, 2), (8, 3)] * 2
     from mani_skill.trajectory import replay_trajectory
 
     flags = ("--traj-path", run / "videos/trajectory_1.h5", "--sim-backend", "physx_cpu", "--allow-failure",
@@ -256,25 +289,41 @@ def test_videos_and_trajectories(in_tmp, capfd):
     replay_trajectory.main(replay_trajectory.parse_args([*map(str, flags)]))
     assert list((run / "videos").glob("trajectory_1.state*.h5")), "the replayed trajectory"
 
+    # --evaluate films the first four episodes
+    flags = ("--evaluate", "--checkpoint", run / "last.pt", "--num_actors", 1, "--eval_seed", 7, "--no-cuda")
+    assert ppo.main([*map(str, flags)]) == 0
+    videos = [run / f"test_videos/seed_{seed}.mp4" for seed in range(7, 11)]
+    assert sorted((run / "test_videos").iterdir()) == sorted(videos)
+    assert all(8 <= len(frames(video)) <= 10 for video in videos)
+    output = capfd.readouterr().out
+    assert all(str(video) in output for video in videos)
+
 
 @pytest.mark.render
-def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, monkeypatch, capsys):
+def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, monkeypatch):
+    """And leaves nothing behind in the next one."""
+
     def full(*args, **kwargs):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(sys.modules[ppo.RecordEpisode.__module__], "images_to_video", full)
-    args = ppo.Args(env_id="MS-CartpoleBalance-v1", sim_backend="physx_cpu", num_eval_envs=1, num_eval_episodes=2)
-    envs = ppo.make_envs(replace(args, env_kwargs='{"max_episode_steps": 3}'), tmp_path, evaluation=True)
+    args = ppo.Args(env_id="MS-CartpoleBalance-v1", sim_backend="physx_cpu", env_kwargs='{"max_episode_steps": 3}')
+    film = ppo.Film(args, tmp_path)
+    envs = ppo.make_envs(args, 1, 0)
     agent = ppo.Agent(envs.single_observation_space, envs.single_action_space, args)
-    episodes = ppo.evaluate(agent, envs, 2, 0, 3, torch.device("cpu"))
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules[ppo.RecordEpisode.__module__], "images_to_video", full)
+        film.record(agent, "first", 3, seed=0)
+    assert "No space left on device" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    film.record(agent, "second", 3, seed=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["second.mp4"]
+    assert 3 <= len(frames(tmp_path / "second.mp4")) <= 5
+    film.close()
     envs.close()
-    assert (episodes["episode_len"] == 3).all() and not list(tmp_path.iterdir())
-    assert "No space left on device" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_learns_a_task_of_maniskill(tmp_path):
-    """In the pool, as a user would; a task that is cheap to simulate."""
+    """With the defaults, as a user would; a task that is cheap to simulate."""
     flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 16_000,
              "--eval_freq", 0, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--exp-name", "x",
              "--no-cuda")  # fmt: skip

@@ -5,16 +5,13 @@ import importlib
 import json
 import os
 import subprocess
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import test_task
 import torch
-from batched_physx import batched_physx
 from conftest import ROOT, read_metrics
-from test_cpu_vector_env import play
 from test_task import EXAMPLES, NUM_ENVS, everything, make, seeds
 
 import ppo
@@ -22,14 +19,6 @@ import ppo_rgb
 
 # isort: split
 from mani_skill.utils.structs import Pose
-
-ARGS = ppo.Args(sim_backend="physx_cpu", num_envs=NUM_ENVS, capture_video=False, reconfiguration_freq=0)
-
-
-@pytest.fixture
-def stand_in():
-    with batched_physx():
-        yield
 
 
 @pytest.mark.parametrize(
@@ -41,7 +30,7 @@ def stand_in():
         pytest.param("PushCube-v1", marks=pytest.mark.xfail(strict=True, raises=AssertionError)),
     ],
 )
-def test_episodes_follow_from_their_seeds(stand_in, env_id):
+def test_episodes_follow_from_their_seeds(env_id):
     """Whenever an environment resets, and whichever others do with it."""
     env = make(env_id, num_envs=NUM_ENVS)
     histories = []
@@ -62,42 +51,45 @@ def test_episodes_follow_from_their_seeds(stand_in, env_id):
 
 
 @pytest.mark.parametrize("env_id", EXAMPLES)
-def test_same_start_on_cpu_and_gpu(env_id):
+def test_same_start_in_a_batch_as_alone(env_id):
     """Each environment of a batch starts as one alone does with its seed, blocks of many sizes included."""
     options = dict(reconfigure=True)
     alone = []
-    env = gym.make(env_id, obs_mode="state", sim_backend="physx_cpu", render_backend="none")
+    env = make(env_id, num_envs=1)
     for seed in seeds(40):
         obs, _ = env.reset(seed=seed, options=options)
         alone.append(obs)
     env.close()
-    with batched_physx():
-        env = make(env_id, num_envs=NUM_ENVS)
-        obs, _ = env.reset(seed=seeds(40), options=options)
-        torch.testing.assert_close(obs, torch.cat(alone), rtol=1e-4, atol=1e-5)
-        env.close()
+    env = make(env_id, num_envs=NUM_ENVS)
+    obs, _ = env.reset(seed=seeds(40), options=options)
+    torch.testing.assert_close(obs, torch.cat(alone), rtol=1e-4, atol=1e-5)
+    env.close()
 
 
-def test_cpu_pool_equals_gpu_batch(stand_in, tmp_path):
-    """The same seeds and actions in worker processes and in ManiSkill's batch: the same episodes, resets, metrics, and
-    levels of the curriculum."""
-    args = replace(ARGS, env_id=EXAMPLES[2], env_kwargs='{"max_episode_steps": 9}')
-    results = []
-    for backend in ("physx_cpu", "physx_cuda"):
-        envs = ppo.make_envs(replace(args, sim_backend=backend, render_backend="none"), tmp_path)
-        actions = torch.rand(45, NUM_ENVS, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
-        results.append(play(envs, seeds(40), actions))
-        envs.close()
-    resets = 0
-    for pool, batch in zip(*results, strict=True):
-        assert batch.keys() == pool.keys()
-        resets += "info._final_info" in batch
+def play(num_envs, seeds, actions):
+    """The curriculum: observations, rewards, levels, and where episodes ended, of all steps."""
+    envs = ppo.ManiSkillVectorEnv(make(EXAMPLES[2], num_envs=num_envs, max_episode_steps=9), record_metrics=True)
+    obs, _ = envs.reset(seed=seeds)
+    steps = []
+    for action in actions:
+        obs, reward, terminated, truncated, _ = envs.step(action)
+        steps.append(dict(obs=obs, reward=reward, done=terminated | truncated, level=envs.base_env.level))
+    envs.close()
+    return {k: torch.stack([step[k] for step in steps]) for k in steps[0]}
+
+
+def test_batch_equals_single_environments():
+    """The same seeds and actions give the same episodes, resets, and levels of the curriculum."""
+    actions = torch.rand(45, NUM_ENVS, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    batch = play(NUM_ENVS, seeds(40), actions)
+    for i, seed in enumerate(seeds(40)):
+        alone = play(1, [seed], actions[:, i : i + 1])
         for name in batch:
-            torch.testing.assert_close(pool[name], batch[name], rtol=1e-4, atol=1e-5, msg=name)
-    assert resets >= 4
+            torch.testing.assert_close(batch[name][:, i], alone[name][:, 0], rtol=1e-4, atol=1e-5, msg=name)
+    assert batch["done"].sum() >= 4 * NUM_ENVS
 
 
-def test_full_table(stand_in, monkeypatch):
+def test_full_table(monkeypatch):
     """Blocks for which there is no place lie on the floor, not in each other; the others are where they were."""
     from examples.push_from_clutter import PushFromClutterEnv
 
@@ -107,14 +99,14 @@ def test_full_table(stand_in, monkeypatch):
     heights = torch.stack([block.pose.p[:, 2] for block in env.unwrapped.blocks], dim=1)
     on_floor = (heights < -0.5).sum(dim=1)
     assert ((on_floor > 0) & (on_floor < 29)).all() and (heights[:, 0] > 0).all()
+    env.unwrapped.scene.px.step()
     for system in env.unwrapped.scene.px.systems:
-        system.step()
         depths = [-point.separation for contact in system.get_contacts() for point in contact.points]
         assert max(depths) < 2e-3
     env.close()
 
 
-def test_curriculum(stand_in):
+def test_curriculum():
     envs = ppo.ManiSkillVectorEnv(make(EXAMPLES[2], num_envs=4, max_episode_steps=5), record_metrics=True)
     task, still = envs.base_env, torch.zeros(4, 8)
     envs.reset(seed=[0, 1, 2, 3])
@@ -190,7 +182,7 @@ OTHER_CUBE = """
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_broken_copies_are_found(stand_in, fault, tmp_path, monkeypatch):
+def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
     right, wrong, message = FAULTS[fault]
     source = (ROOT / "examples/push_to_goal.py").read_text()
     assert right in source
@@ -216,10 +208,10 @@ def test_broken_copies_are_found(stand_in, fault, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("env_id", EXAMPLES)
 def test_trains(env_id, in_tmp):
-    flags = ("--env_id", env_id, "--num_envs", 1, "--num_steps", 40, "--total_timesteps", 80, "--num_minibatches", 2,
-             "--num_eval_envs", 1, "--num_eval_episodes", 2, "--eval_reconfiguration_freq", 1, "--no-cuda",
-             "--env_kwargs", json.dumps(dict(max_episode_steps=10)), "--exp-name", "x",
-             "--no-capture_video")  # fmt: skip
+    flags = ("--env_id", env_id, "--num_envs", 2, "--num_actors", 1, "--num_steps", 20, "--total_timesteps", 80,
+             "--num_minibatches", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2,
+             "--eval_reconfiguration_freq", 1, "--no-cuda", "--env_kwargs", json.dumps(dict(max_episode_steps=10)),
+             "--exp-name", "x", "--no-capture_video")  # fmt: skip
     assert ppo.main([*map(str, flags)]) == 0
     rows = read_metrics(in_tmp / "runs/x")
     assert all(np.isfinite(row["return"]) for row in rows)
@@ -252,7 +244,7 @@ def test_recipes_are_commands(tmp_path, monkeypatch):
 def test_from_images(env_id):
     """Cameras show the objects, and not the goal, which is in the state."""
     args = ppo_rgb.Args(env_id=env_id, sim_backend="physx_cpu", camera_width=64, camera_height=64, shader="minimal")
-    env = ppo_rgb.make_env(replace(args, capture_video=False), None, False)
+    env = ppo_rgb.make_env(args, 1)
     task = env.unwrapped
     obs, _ = env.reset(seed=0)
     assert obs["rgb"].shape == (1, 64, 64, 3)

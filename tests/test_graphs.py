@@ -164,6 +164,28 @@ def test_other_functions_are_captured(cuda, script, capsys):
     assert len(calls) == 4 and not capsys.readouterr().out
 
 
+def test_an_observation_lies_where_the_graph_finds_it(cuda, device, script):
+    """Copied there at every call; the function itself is called up to the capture."""
+    seen = []
+
+    def double(obs):
+        seen.append(obs)
+        return 2 * script.as_dict(obs)["state"]
+
+    for names in (None, ("state", "rgb")):
+        seen.clear()
+        launch = script.as_cuda_graph(double, True)
+        for call in range(6):
+            state = torch.full((2, 3), float(call), device=device)
+            obs = {name: state.clone() for name in names} if names else state
+            result = launch(obs)
+            for value in script.as_dict(seen[0]).values():
+                assert torch.equal(value, state) and value.data_ptr() != state.data_ptr()
+            if call < 4 or device.type == "cuda":
+                assert torch.equal(result, 2 * state)
+        assert len(seen) == 4 and all(x is seen[0] for x in seen)
+
+
 CANNOT_BE_CAPTURED = """
 import torch, {script} as script
 calls = []
@@ -223,10 +245,10 @@ class Guard:
 
 
 def test_the_host_looks_at_nothing_in_rollout_and_update(train, script, device, monkeypatch):
-    """From a step of the policy to the next, but for the environments' step (ManiSkillVectorEnv asks whether an episode
-    ended), and in an epoch of the update; between them it may, once an iteration or epoch."""
+    """From the first step of the policy to the end of the rollout, but for the environments' step (ManiSkillVectorEnv
+    asks whether an episode ended), and in an epoch of the update; between them it may, once an iteration or epoch."""
     guard = Guard(monkeypatch, device)
-    step = script.ManiSkillVectorEnv.step
+    step, rollout = script.ManiSkillVectorEnv.step, script.rollout
     guarded_calls = []
 
     def unguarded_step(self, actions):
@@ -237,19 +259,27 @@ def test_the_host_looks_at_nothing_in_rollout_and_update(train, script, device, 
         finally:
             guard.set(was_on)
 
+    def guarded_rollout(*arguments):
+        try:
+            return rollout(*arguments)
+        finally:
+            assert guard.on
+            guard.set(False)
+
     def guarded(function, enabled):
-        def launch():
+        def launch(*obs):
             guard.set(True)
             try:
-                return function()
+                return function(*obs)
             finally:
-                guard.set(function.__name__ == "policy_step")  # the rollout goes on
+                guard.set(function.__name__ == "sample_action")  # the rollout goes on
                 guarded_calls.append(function.__name__)
 
         return launch
 
     monkeypatch.setattr(script.ManiSkillVectorEnv, "step", unguarded_step)
+    monkeypatch.setattr(script, "rollout", guarded_rollout)
     monkeypatch.setattr(script, "as_cuda_graph", guarded)
     train(norm_obs=True)
-    assert guarded_calls.count("policy_step") == 40 and guarded_calls.count("estimate_advantages") == 4
+    assert guarded_calls.count("sample_action") == 40 and guarded_calls.count("estimate_advantages") == 4
     assert guarded_calls.count("update_epoch") >= 4 and guard.count > 0

@@ -26,6 +26,9 @@ import ppo
         ("--reward_mode sparse --env_id MS-AntRun-v1", "normalized_dense, dense, none"),
         ("--obs_mode rgb", "state"),
         ("--num_envs 0", "num_envs"),
+        ("--num_actors 0", "num_actors"),
+        ("--num_envs 2 --num_actors 3", "--num_actors 3: there are 2 environments"),
+        ("--reconfiguration_freq 1 --num_envs 2 --num_actors 1", "--no-partial_reset"),
         ("--num_steps -1", "num_steps"),
         ("--learning_rate nan", "learning_rate"),
         ("--learning_rate 0", "learning_rate"),
@@ -120,7 +123,7 @@ def test_notes(arguments, note, in_tmp, capsys):
 
 
 VALID = {
-    "num_envs": [1, 2, 7], "num_eval_envs": [1, 3], "num_eval_episodes": [1, 4], "num_steps": [4, 9],
+    "num_envs": [1, 2, 7], "num_eval_envs": [1, 3], "num_actors": [1], "num_eval_episodes": [1, 4], "num_steps": [4, 9],
     "num_minibatches": [1, 3, 4], "update_epochs": [1, 2], "learning_rate": [1e-9, 0.1, 3], "seed": [0, 2**40],
     "critic_learning_rate": [0, 1e-3, None], "gamma": [0, 0.97, 1], "gae_lambda": [0, 0.5, 1], "clip_coef": [0.01, 5],
     "ent_coef": [0, 0.1], "vf_coef": [0, 2], "max_grad_norm": [1e-3, 100], "target_kl": [None, 0, 0.02],
@@ -138,9 +141,9 @@ SWITCHES = [
 ]  # fmt: skip
 NUMBERS = ["0", "-1", "1.5.", "nan", "inf", "x", ""]
 INVALID = {
-    **{flag: NUMBERS for flag in ("num_envs", "num_eval_envs", "num_steps", "num_minibatches", "update_epochs",
-                                  "num_eval_episodes", "learning_rate", "clip_coef", "max_grad_norm", "checkpoint_freq",
-                                  "checkpoint_minutes", "reward_scale")},
+    **{flag: NUMBERS for flag in ("num_envs", "num_eval_envs", "num_actors", "num_steps", "num_minibatches",
+                                  "update_epochs", "num_eval_episodes", "learning_rate", "clip_coef", "max_grad_norm",
+                                  "checkpoint_freq", "checkpoint_minutes", "reward_scale")},
     **{flag: NUMBERS[1:] for flag in ("seed", "eval_freq", "ent_coef", "vf_coef", "target_kl", "eval_seed")},
     **{flag: [*NUMBERS[1:], "1.1"] for flag in ("gamma", "gae_lambda", "stop_at_success")},
     "logstd_init": ["nan", "inf", "?"], "total_timesteps": ["0", "3", "-5", "1e5x"],
@@ -166,13 +169,15 @@ def test_fuzz(in_tmp, capsys, monkeypatch):
 
     counts = [0, 0]
     for k in range(200):
-        base = dict(num_envs=7, num_eval_envs=2, num_eval_episodes=2, num_steps=9, total_timesteps=126,
+        base = dict(num_envs=7, num_eval_envs=2, num_actors=1, num_eval_episodes=2, num_steps=9, total_timesteps=126,
                     num_minibatches=4, update_epochs=1, exp_name=f"run{k}")  # fmt: skip
         chosen = base | {flag: rng.choice(VALID[flag]) for flag in rng.sample([*VALID], rng.randrange(12))}
         if chosen["num_envs"] * chosen["num_steps"] < chosen["num_minibatches"]:
             chosen["num_minibatches"] = 1
         chosen["exp_name"] = f"run{k}/{chosen['exp_name']}"
         switches = ["--" + rng.choice(["", "no-"]) + flag for flag in rng.sample(SWITCHES, rng.randrange(5))]
+        if chosen.get("reconfiguration_freq"):  # together with partial resets it is refused
+            switches = [x for x in switches if not x.endswith("-partial_reset")] + ["--no-partial_reset"]
         invalid = rng.random() < 0.5
         if invalid:
             flag = rng.choice([*INVALID])

@@ -16,8 +16,8 @@ from conftest import ROOT, box, read_metrics, refused
 import ppo
 import ppo_rgb
 
-FLAGS = ("--num_envs", 32, "--num_eval_envs", 4, "--num_eval_episodes", 5, "--num_steps", 10, "--num_minibatches", 4,
-         "--no-cuda", "--no-capture_video", "--eval_freq", 2)  # fmt: skip
+FLAGS = ("--num_envs", 32, "--num_eval_envs", 4, "--num_actors", 2, "--num_eval_episodes", 5, "--num_steps", 10,
+         "--num_minibatches", 4, "--no-cuda", "--no-capture_video", "--eval_freq", 2)  # fmt: skip
 
 
 def launch(cwd, *arguments):
@@ -132,8 +132,8 @@ if __name__ == "__main__":  # in each of the processes
         agents.append(make_agent(*arguments))
         return agents[-1]
 
-    def envs_that_tell(args, *arguments, **kwargs):
-        envs = batched_env.make_envs(args, *arguments, **kwargs)
+    def envs_that_tell(*arguments, **kwargs):
+        envs = batched_env.make_envs(*arguments, **kwargs)
         step = envs.step
         envs.step = lambda action: actions.append(action) or step(action)
         return envs

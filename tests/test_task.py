@@ -2,12 +2,10 @@
 
     pytest tests/test_task.py --env_id my_module:MyTask-v1
 
-Resets of some of several environments need a GPU in ManiSkill. Here they run ManiSkill's own code for it on
-tests/batched_physx.py, which simulates on the CPU, and on `physx_cuda` itself where there is one; the summary
+A batch is simulated on the CPU, as ppo.py lets ManiSkill do it, and on `physx_cuda` where there is one; the summary
 says where.
 """
 
-import contextlib
 import os
 import sys
 from pathlib import Path
@@ -15,7 +13,6 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import torch
-from batched_physx import batched_physx
 
 import ppo
 
@@ -40,21 +37,25 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("env_id", given or EXAMPLES + MANISKILL, scope="module")
 
 
-def make(env_id, **kwargs):
-    return gym.make(env_id, obs_mode="state", sim_backend="physx_cuda", render_backend="none", **kwargs)
+def make(env_id, sim_backend="physx_cpu", **kwargs):
+    return gym.make(env_id, obs_mode="state", sim_backend=sim_backend, render_backend="none", **kwargs)
 
 
-@pytest.fixture(scope="module", params=["stand-in", "physx_cuda"])
-def envs(env_id, request):
-    """NUM_ENVS environments of the task in one batch."""
+@pytest.fixture(scope="module", params=["physx_cpu", "physx_cuda"])
+def sim_backend(request):
     if request.param == "physx_cuda" and not (
         torch.cuda.is_available() and [*Path.home().glob(".sapien/physx/*/libPhysX*")]
     ):
         pytest.skip("needs a GPU, and PhysX's library for it, which SAPIEN fetches when it first simulates there")
-    with batched_physx() if request.param == "stand-in" else contextlib.nullcontext():
-        env = make(env_id, num_envs=NUM_ENVS)
-        yield env
-        env.close()
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def envs(env_id, sim_backend):
+    """NUM_ENVS environments of the task in one batch."""
+    env = make(env_id, sim_backend, num_envs=NUM_ENVS)
+    yield env
+    env.close()
 
 
 # ----- what is looked at ----------------------------------------------------------------------------------------------
@@ -182,7 +183,7 @@ def check_partial_reset(env):
         before = everything(env)
         reset_some(env, env_idx)
         after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
-        exact = hasattr(env.unwrapped.scene.px, "systems")  # the stand-in; PhysX may compute last bits anew
+        exact = ppo.is_batch(env.unwrapped.scene)  # on the CPU; a GPU may compute last bits anew
         for name in rows_of(env, before):
             assert before[name].shape == after[name].shape, (
                 f"the {name} has shape {tuple(after[name].shape)} after a reset of environments {env_idx}: write to "
@@ -196,15 +197,16 @@ def check_partial_reset(env):
 
 
 def check_overlap(env, resets=1000, tolerance=2e-3):
-    """No free object starts inside another, by PhysX's own contacts; only where the stand-in simulates."""
+    """No free object starts inside another, by PhysX's own contacts; only on the CPU."""
     _, info = env.reset(seed=seeds(10_000))
     solved = 0
     for k in range(resets // NUM_ENVS):
         if "success" in info:
             solved += int(info["success"].sum())
-        for i, system in enumerate(env.unwrapped.scene.px.systems):
+        scene = env.unwrapped.scene
+        scene.px.step()
+        for i, system in enumerate(scene.px.systems):
             free = {body for body in system.rigid_dynamic_components if not body.kinematic}
-            system.step()
             for contact in system.get_contacts():
                 if free & set(contact.bodies):
                     depth = -min([point.separation for point in contact.points], default=0)
@@ -212,6 +214,7 @@ def check_overlap(env, resets=1000, tolerance=2e-3):
                     assert depth < tolerance, (
                         f"{names} overlap by {1000 * depth:.0f} mm in reset {k} of environment {i}"
                     )
+        scene._gpu_fetch_all()
         _, info = env.reset()
     assert solved <= resets / 20, f"{solved} of {resets} episodes start in success"
 
@@ -264,12 +267,12 @@ def check_restoring_states(env):
         del env.unwrapped._initialize_episode
 
 
-def check_rewards(env_id, steps=60):
+def check_rewards(env_id, sim_backend, steps=60):
     """Normalised dense rewards are within [0, 1], in success too, dense ones bounded; random actions do not always
     succeed."""
     modes = ppo.find_task(env_id).cls.SUPPORTED_REWARD_MODES
     for mode in [mode for mode in ("normalized_dense", "dense") if mode in modes]:
-        env = make(env_id, num_envs=NUM_ENVS, reward_mode=mode)
+        env = make(env_id, sim_backend, num_envs=NUM_ENVS, reward_mode=mode)
         env.reset(seed=seeds(3))
         succeeded = torch.zeros(NUM_ENVS, dtype=torch.bool)
         for step in range(steps):
@@ -287,9 +290,10 @@ def check_rewards(env_id, steps=60):
         assert not succeeded.all(), "random actions succeed everywhere: what is success?"
 
 
-def check_autoreset(env_id):
+def check_autoreset(env_id, sim_backend):
     """Where an episode ended, the final observation is not the first of the next one."""
-    envs = ppo.ManiSkillVectorEnv(make(env_id, num_envs=NUM_ENVS, max_episode_steps=6), record_metrics=True)
+    env = make(env_id, sim_backend, num_envs=NUM_ENVS, max_episode_steps=6)
+    envs = ppo.ManiSkillVectorEnv(env, record_metrics=True)
     envs.reset(seed=seeds(3))
     ended = torch.zeros(NUM_ENVS, dtype=torch.bool)
     for _ in range(14):
@@ -323,8 +327,8 @@ def test_partial_reset(envs):
 
 
 def test_no_overlap(envs, env_id, request):
-    if not hasattr(envs.unwrapped.scene.px, "systems"):
-        pytest.skip("contacts are asked of the stand-in")
+    if not ppo.is_batch(envs.unwrapped.scene):
+        pytest.skip("contacts are asked of the simulation on the CPU")
     check_overlap(envs, resets=1000 if "examples" in env_id or request.config.getoption("--env_id") else 250)
 
 
@@ -336,9 +340,9 @@ def test_restoring_states(envs):
     check_restoring_states(envs)
 
 
-def test_rewards(envs, env_id):
-    check_rewards(env_id)
+def test_rewards(env_id, sim_backend):
+    check_rewards(env_id, sim_backend)
 
 
-def test_autoreset(envs, env_id):
-    check_autoreset(env_id)
+def test_autoreset(env_id, sim_backend):
+    check_autoreset(env_id, sim_backend)
