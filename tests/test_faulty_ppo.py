@@ -1,0 +1,278 @@
+"""The steps that stand inline in `train`, each against its own definition, on records of short runs."""
+
+import contextlib
+import copy
+import json
+import math
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from batched_env import BatchedReach
+from conftest import SMALL
+from test_rollout import gae_of_episodes
+
+import ppo
+
+NUM_ENVS, NUM_STEPS, ITERATIONS = 8, 6, 4
+# env_id is that of any task: `make_envs` gives another one
+ARGS = replace(
+    SMALL, env_id="PushCube-v1", num_actors=1, num_envs=NUM_ENVS, num_steps=NUM_STEPS, num_eval_envs=2,
+    num_eval_episodes=3, total_timesteps=NUM_ENVS * NUM_STEPS * ITERATIONS, num_minibatches=4, update_epochs=3,
+    eval_freq=1, exp_name="x", target_kl=None, gamma=0.9, gae_lambda=0.7, learning_rate=1e-3,
+)  # fmt: skip
+
+
+class Reach(BatchedReach):
+    """Reach with what ManiSkill has besides: the seeds of all environments where some are reset."""
+
+    max_episode_steps = 5
+
+    def __init__(self, num_envs):
+        super().__init__(num_envs, "cpu")
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None and options:
+            seed = [seed[i] for i in options["env_idx"]]
+        return super().reset(seed=seed, options=options)
+
+    def _set_main_rng(self, seeds):
+        pass
+
+    def _set_episode_rng(self, seeds, env_idx):
+        pass
+
+
+def copied(x):
+    return {k: v.detach().clone() for k, v in x.items()}
+
+
+class Run:
+    """A run of `train` and what happened in it, iteration by iteration."""
+
+    def __init__(self, monkeypatch, args, evaluations=None):
+        self.args, self.iterations, self.evaluations = args, [], []
+        rollout, update, evaluate = ppo.rollout, ppo.update_minibatch, ppo.evaluate
+
+        def make_envs(args, num_envs, seed, evaluation=False, record=None):
+            return ppo.ManiSkillVectorEnv(
+                Reach(num_envs), auto_reset=not evaluation, ignore_terminations=evaluation, record_metrics=True
+            )
+
+        def spy_rollout(agent, envs, storage, obs, args, sample_action):
+            before, obs = copied(agent.state_dict()), obs.clone()
+            result = rollout(agent, envs, storage, obs, args, sample_action)
+            sums = {k: v.item() for k, v in result[1].items()}
+            records = dict(first_obs=obs, next_obs=result[0].clone(), storage=copied(storage), before=before)
+            self.iterations.append(dict(**records, sums=sums, updates=[]))
+            return result
+
+        def spy_update(agent, optimizer, args, *minibatch):
+            rates = [float(group["lr"]) for group in optimizer.param_groups]
+            rows = [x.detach().clone() for x in minibatch]
+            statistics = copied({k: v for k, v in agent.state_dict().items() if k.startswith("obs_")})
+            metrics = update(agent, optimizer, args, *minibatch)
+            self.iterations[-1]["updates"].append(
+                dict(rates=rates, rows=rows, statistics=statistics, metrics=metrics.clone())
+            )
+            self.iterations[-1]["after_updates"] = copied(agent.state_dict())
+            return metrics
+
+        def spy_evaluate(agent, envs, *arguments, **flags):
+            result = evaluate(agent, envs, *arguments, **flags)
+            if evaluations:
+                result = {k: torch.tensor(v).float() for k, v in evaluations[len(self.evaluations)].items()}
+            self.evaluations.append(dict(arguments=arguments, weights=copied(agent.state_dict()), flags=flags))
+            return result
+
+        monkeypatch.setattr(ppo, "make_envs", make_envs)
+        monkeypatch.setattr(ppo, "rollout", spy_rollout)
+        monkeypatch.setattr(ppo, "update_minibatch", spy_update)
+        monkeypatch.setattr(ppo, "evaluate", spy_evaluate)
+        monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)
+        monkeypatch.setattr(ppo, "open_tensorboard", lambda run_dir: Mock())
+        with contextlib.ExitStack() as closing:
+            self.code = ppo.train(copy.copy(args), closing)
+        self.folder = ppo.find_run_dir(args)
+        rows = [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
+        self.train_rows = [row for row in rows if row["kind"] == "train"]
+        self.eval_rows = [row for row in rows if row["kind"] == "eval"]
+
+    def checkpoint(self, name):
+        return ppo.load_checkpoint(self.folder / name)
+
+
+@pytest.fixture
+def run(in_tmp, monkeypatch):
+    return lambda evaluations=None, **flags: Run(monkeypatch, replace(ARGS, **flags), evaluations)
+
+
+def flat_batch(args, storage):
+    """The rows to learn from, by name, as (step, environment) follow each other; advantages by their definition."""
+    columns = {k: v.double().numpy() for k, v in storage.items()}
+    advantages = gae_of_episodes(columns, args.gamma, args.gae_lambda, args.finite_horizon_gae)
+    columns |= dict(advantages=advantages, returns=advantages + columns["values"])
+    names = ("obs", "actions", "logprobs", "advantages", "returns", "values")
+    return [columns[k].reshape(NUM_ENVS * NUM_STEPS, -1) for k in names]
+
+
+@pytest.mark.parametrize("finite_horizon", [False, True])
+def test_each_epoch_learns_from_each_sample_once(run, finite_horizon):
+    """The minibatches of an epoch are a permutation of the rollout, whole rows of it, another one in each epoch."""
+    record = run(finite_horizon_gae=finite_horizon, norm_obs=True)
+    orders = []
+    assert len(record.iterations) == ITERATIONS
+    for iteration in record.iterations:
+        truth = flat_batch(record.args, iteration["storage"])
+        assert len(iteration["updates"]) == 3 * 4
+        place = {x: i for i, x in enumerate(truth[2][:, 0].tolist())}  # log-probabilities tell the rows apart
+        assert len(place) == NUM_ENVS * NUM_STEPS
+        for epoch in range(3):
+            updates = iteration["updates"][4 * epoch : 4 * epoch + 4]
+            got = [torch.cat(x).double().numpy() for x in zip(*(update["rows"] for update in updates))]
+            order = [place[x] for x in got[2].tolist()]
+            assert sorted(order) == [*range(NUM_ENVS * NUM_STEPS)]
+            orders.append(tuple(order))
+            for ours, theirs in zip(got, truth, strict=True):
+                np.testing.assert_allclose(ours.reshape(len(order), -1), theirs[order], rtol=1e-4, atol=1e-5)
+    assert len(set(orders)) == len(orders) and tuple(range(NUM_ENVS * NUM_STEPS)) not in orders
+
+
+def test_a_remainder_sits_out_at_random(run):
+    record = run(num_minibatches=5, update_epochs=4, total_timesteps=NUM_ENVS * NUM_STEPS)
+    (iteration,) = record.iterations
+    left_out = []
+    for epoch in range(4):
+        rows = [update["rows"][2] for update in iteration["updates"][5 * epoch : 5 * epoch + 5]]
+        assert [len(x) for x in rows] == [9] * 5 and len(torch.cat(rows).unique()) == 45
+        left_out.append(set(iteration["storage"]["logprobs"].flatten().tolist()) - set(torch.cat(rows).tolist()))
+    assert len({frozenset(x) for x in left_out}) > 1
+
+
+def test_learning_rates(run):
+    """They fall linearly, from the peak in the first iteration to one part of it in the last, or stay."""
+    for anneal_lr in (True, False):
+        record = run(anneal_lr=anneal_lr, critic_learning_rate=5e-3, exp_name=f"anneal_{anneal_lr}")
+        for number, iteration in enumerate(record.iterations):
+            factor = 1 - number / ITERATIONS if anneal_lr else 1
+            for update in iteration["updates"]:
+                assert update["rates"] == pytest.approx([1e-3 * factor, 5e-3 * factor])
+            assert record.train_rows[number]["learning_rate"] == pytest.approx(1e-3 * factor)
+
+
+def test_normalization_follows_the_update(run):
+    """Statistics are those that the rollout acted with until its update is over, then those of all data so far."""
+    record = run(norm_obs=True)
+    seen = []
+    for number, iteration in enumerate(record.iterations):
+        statistics = {k: v for k, v in iteration["before"].items() if k.startswith("obs_")}
+        for update in iteration["updates"]:
+            assert all(torch.equal(update["statistics"][k], statistics[k]) for k in statistics)
+        seen.append(iteration["storage"]["obs"].flatten(0, 1).double())
+        later = (
+            record.iterations[number + 1]["before"] if number + 1 < ITERATIONS else record.evaluations[-1]["weights"]
+        )
+        data = torch.cat(seen)
+        torch.testing.assert_close(later["obs_mean"].double(), data.mean(0), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(later["obs_var"].double(), data.var(0, correction=0), rtol=1e-4, atol=1e-4)
+        assert later["obs_count"].item() == pytest.approx(len(data), rel=1e-4)
+    off = run(exp_name="off").checkpoint("last.pt")["agent"]
+    assert not off["obs_mean"].any() and (off["obs_var"] == 1).all()
+
+
+def test_the_first_epoch_beyond_target_kl_is_the_last(run):
+    """By the mean over an epoch's minibatches; the threshold lies between what the epochs of a longer run had."""
+
+    def divergences(record):
+        kl = [[update["metrics"][ppo.KL].item() for update in i["updates"]] for i in record.iterations]
+        return [np.mean(np.reshape(x, (-1, 4)), axis=1).tolist() for x in kl]
+
+    flags = dict(update_epochs=6, learning_rate=3e-3)
+    free = divergences(run(**flags, exp_name="free"))
+    assert all(len(x) == 6 for x in free) and free[0][1] > free[0][0]
+    target = (sorted(free[0])[2] + sorted(free[0])[3]) / 2
+    stopped = divergences(run(**flags, target_kl=target, exp_name="stopped"))
+    first = next(i for i, x in enumerate(free[0]) if x > target)
+    assert 0 < first < 5 and stopped[0] == pytest.approx(free[0][: first + 1])
+    for epochs in stopped:
+        assert all(x <= target for x in epochs[:-1]) and (len(epochs) == 6 or epochs[-1] > target)
+
+
+def test_each_rollout_acts_with_what_was_learned_before_it(run):
+    record = run()
+    weights = lambda state: torch.cat([v.flatten() for k, v in state.items() if not k.startswith("obs_")])
+    for number, iteration in enumerate(record.iterations):
+        after = weights(iteration["after_updates"])
+        assert not torch.equal(weights(iteration["before"]), after)
+        assert torch.equal(weights(record.evaluations[number]["weights"]), weights(iteration["before"]))
+        if number + 1 < ITERATIONS:
+            following = record.iterations[number + 1]
+            assert torch.equal(weights(following["before"]), after)
+            assert torch.equal(following["first_obs"], iteration["next_obs"]), "episodes go on"
+    last = record.checkpoint("last.pt")
+    assert torch.equal(weights(last["agent"]), after) and torch.equal(weights(record.evaluations[-1]["weights"]), after)
+    assert last["iteration"] == ITERATIONS and last["global_step"] == ARGS.total_timesteps and record.code == 0
+
+
+def test_evaluations(run):
+    """Always the same episodes, without exploration, at the steps that the rows name."""
+    record = run(eval_seed=70, eval_freq=2)
+    assert [row["global_step"] for row in record.eval_rows] == [0, 96, 192]
+    for evaluation in record.evaluations:
+        num_episodes, seed, num_steps, rebuild, separately = evaluation["arguments"]
+        assert (num_episodes, seed, num_steps, rebuild, separately) == (3, 70, 5, 0, True)
+        assert not evaluation["flags"]
+
+
+def test_training_rows(run):
+    """Means over the episodes that ended, over all minibatches, and the explained variance by its definition."""
+    record = run(reward_scale=0.1)
+    for row, iteration in zip(record.train_rows, record.iterations, strict=True):
+        sums = dict(iteration["sums"])
+        count = sums.pop("num_episodes")
+        assert row["num_episodes"] == count > 0
+        assert {k: row[k] for k in sums} == pytest.approx({k: v / count for k, v in sums.items()})
+        means = torch.stack([update["metrics"] for update in iteration["updates"]]).mean(0).tolist()
+        assert [row[k] for k in ppo.UPDATE_METRICS] == pytest.approx(means, rel=1e-3, abs=1e-7)
+        *_, returns, values = flat_batch(record.args, iteration["storage"])
+        explained = 1 - np.var(returns - values, ddof=1) / np.var(returns, ddof=1)
+        assert row["explained_variance"] == pytest.approx(explained, rel=1e-3)
+    assert [row["global_step"] for row in record.train_rows] == [48, 96, 144, 192]
+
+
+def scripted(*scores):
+    return [dict(zip(("success_once", "return"), score)) for score in scores]
+
+
+@pytest.mark.parametrize(
+    "scores, best",
+    [
+        # success counts first, whatever the return
+        ([([0, 0], [5, 5]), ([0, 1], [0, 1]), ([0, 0], [9, 9]), ([0, 1], [2, 2]), ([0, 1], [1, 1])], 3),
+        # of equals the first stays
+        ([([1, 1], [3, 3]), ([1, 1], [3, 3]), ([1, 1], [2, 3]), ([1, 1], [3, 3]), ([0, 1], [9, 9])], 0),
+        # what is not finite is never the best
+        ([([0, 0], [1, 1]), ([1, 1], [math.nan, 3]), ([0, 1], [math.inf, 3]), ([0, 1], [1, 1]), ([0, 0], [1, 1])], 3),
+    ],
+)
+def test_the_best_checkpoint(run, scores, best):
+    record = run(scripted(*scores))
+    checkpoint = record.checkpoint("best.pt")
+    assert checkpoint["iteration"] == best and checkpoint["global_step"] == best * NUM_ENVS * NUM_STEPS
+    assert all(torch.equal(v, checkpoint["agent"][k]) for k, v in record.evaluations[best]["weights"].items())
+    assert checkpoint["best_score"] == [pytest.approx(np.mean(x)) for x in scores[best]]
+    assert record.checkpoint("last.pt")["iteration"] == ITERATIONS
+
+
+def test_without_success_the_return_decides(run):
+    record = run([{"return": [x]} for x in (-5.0, -2.0, -3.0, -1.0, -4.0)])
+    assert record.checkpoint("best.pt")["iteration"] == 3
+
+
+@pytest.mark.parametrize("rate, last", [(0.5, 2), (1.0, 3), (None, 4)])
+def test_stop_at_success(run, rate, last):
+    record = run(scripted(*[(x, [0, 0]) for x in ([0, 0], [0, 0], [0, 1], [1, 1], [0, 0])]), stop_at_success=rate)
+    assert record.checkpoint("last.pt")["iteration"] == last and len(record.iterations) == last
+    assert len(record.eval_rows) == last + 1 and record.code == 0
