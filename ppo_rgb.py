@@ -966,7 +966,7 @@ class BatchedCamera:
 
 
 def is_batch(scene: ManiSkillScene) -> bool:
-    return type(scene.px) is BatchedPhysx
+    return scene.gpu_sim_enabled and scene.device.type == "cpu"
 
 
 def batch_on_cpu() -> None:
