@@ -1,6 +1,7 @@
 """ppo_rgb.py: what it sees, what that takes, what it learns from. What it shares with ppo.py is tested there."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,10 +15,13 @@ from conftest import NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_sc
 
 import ppo_rgb
 
-ARGS = ppo_rgb.Args(sim_backend="physx_cpu", capture_video=False, shader="minimal", num_envs=2, num_eval_envs=1)
+ARGS = ppo_rgb.Args(
+    sim_backend="physx_cpu", capture_video=False, shader="minimal", num_envs=2, num_eval_envs=1, num_actors=1
+)
 SMALL_IMAGES = ppo_rgb.Args(
-    env_id="Reach", sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
+    sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_eval_episodes=8, num_steps=10,
     total_timesteps=16 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False, norm_obs=True,
+    num_actors=1,
 )  # fmt: skip
 ALL_TEXTURES = "rgb+depth+segmentation+position+normal+albedo"
 
@@ -47,7 +51,7 @@ def small():
 def test_observations_are_maniskills(env_id, obs_mode, flags):
     """Shapes, dtypes, values and the printed size against ManiSkill's own, for every texture and two cameras."""
     args = replace(ARGS, env_id=env_id, obs_mode=obs_mode, **flags)
-    env = ppo_rgb.make_env(args, None, False)
+    env = ppo_rgb.make_env(args, 1)
     sensors = dict(shader_pack=args.shader, width=args.camera_width or 128, height=args.camera_height or 128)
     raw = gym.make(
         env_id, obs_mode=obs_mode, sensor_configs=sensors, sim_backend="physx_cpu", reward_mode="normalized_dense",
@@ -107,9 +111,9 @@ def test_view():
     """Every texture can be filmed, beside the scene or without one."""
     args = replace(
         ARGS, env_id="MS-CartpoleBalance-v1", obs_mode=ALL_TEXTURES, shader="default", camera_width=40,
-        camera_height=40, capture_video=True, frame_stack=2,
+        camera_height=40, frame_stack=2,
     )  # fmt: skip
-    env = ppo_rgb.make_env(args, "unused", True).env  # without the recorder
+    env = ppo_rgb.make_env(args, 1, evaluation=True, film=True)
     env.reset(seed=0)
     env.step(env.action_space.sample())
     for render_mode, height, width in (("all", 512, 512 + 85 + 11), ("rgb_array", 512, 512), ("sensors", 6 * 40, 48)):
@@ -121,6 +125,46 @@ def test_view():
     env.unwrapped.render_mode = "all"
     assert torch.equal(env.render(), image)
     env.close()
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("env_id, robot", [("MS-CartpoleBalance-v1", None), ("PickCube-v1", "panda_wristcam")])
+def test_a_batch_sees_what_single_environments_see(env_id, robot):
+    """From equal states on, frame stacks and an episode that begins in one of them included; the goal stays hidden."""
+    args = replace(
+        ARGS, env_id=env_id, robot_uids=robot, obs_mode="rgb+depth+segmentation", frame_stack=3, camera_width=48,
+        camera_height=48,
+    )  # fmt: skip
+    batch, singles = ppo_rgb.make_env(args, 3), [ppo_rgb.make_env(args, 1) for _ in range(3)]
+
+    def start(i):
+        state = batch.unwrapped.get_state_dict()
+        row = {kind: {name: x[i : i + 1] for name, x in states.items()} for kind, states in state.items()}
+        return singles[i].reset(options=dict(reset_to_env_states=dict(env_states=row)))[0]
+
+    obs, _ = batch.reset(seed=[1, 2, 3])
+    expected = [start(i) for i in range(3)]
+    assert len({obs["rgb"][i].float().mean().item() for i in range(3)}) == 3, "no two look the same"
+    for step in range(7):
+        for k in obs:
+            rows = torch.cat([each[k] for each in expected])
+            assert obs[k].dtype == rows.dtype
+            if step == 0:
+                assert torch.equal(obs[k], rows)
+            elif k == "state":
+                torch.testing.assert_close(obs[k], rows, rtol=0, atol=1e-4)
+            else:  # the states drift apart by a millionth, and a pixel at an edge falls to the other side
+                assert obs[k].shape == rows.shape and (obs[k] != rows).float().mean() < 0.01
+        actions = torch.rand(3, *batch.get_wrapper_attr("single_action_space").shape) * 2 - 1
+        obs = batch.step(actions)[0]
+        expected = [env.step(actions[i : i + 1])[0] for i, env in enumerate(singles)]
+        if step == 3:
+            obs, _ = batch.reset(options=dict(env_idx=torch.tensor([1])))
+            expected[1] = start(1)
+            for i, frames in enumerate(obs["rgb"].chunk(3, dim=-1)[0] != obs["rgb"].chunk(3, dim=-1)[2]):
+                assert bool(frames.any()) == (i != 1), "an episode begins with its first frame repeated"
+    for env in (batch, *singles):
+        env.close()
 
 
 def test_frame_stack_with_partial_resets(device):
@@ -152,7 +196,7 @@ def test_frame_stack_with_partial_resets(device):
         same(obs, frames(plain.step(action)[0]))
         if step in (3, 4, 6):
             env_idx = torch.tensor([step % 4, 3 - step % 2], device=device).unique()
-            options, seeds = dict(env_idx=env_idx), list(range(10 + step, 10 + step + len(env_idx)))
+            options, seeds = dict(env_idx=env_idx), list(range(10 + step, 14 + step))
             after = env.reset(seed=seeds, options=options)[0]
             same(after, frames(plain.reset(seed=seeds, options=options)[0], env_idx.tolist()))
             same(obs, kept)
@@ -188,21 +232,23 @@ def test_gradient_reaches_every_parameter(encoder, include_state, channels_last,
         SMALL_IMAGES, obs_mode="rgb+depth+segmentation", encoder=encoder, include_state=include_state,
         channels_last=channels_last,
     )  # fmt: skip
-    envs = batched_env.make_envs(args, None, device=device)
+    envs = batched_env.make_envs(args, 16, 0, device=device)
     agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
     obs, _ = envs.reset(seed=list(range(16)))
     assert set(obs) == {"rgb", "depth", "segmentation"} | ({"state"} if include_state else set())
-    action, logprob, entropy, value = agent.get_action_and_value(obs)
+    action, _, sampled_value = agent.sample_action(obs)
+    _, logprob, entropy, value = agent.get_action_and_value(obs, action)
     assert action.shape == (16, 2) and logprob.shape == entropy.shape == value.shape == (16,)
     (logprob.sum() + entropy.sum() + value.sum()).backward()
     for name, parameter in agent.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
     torch.testing.assert_close(agent.get_value(obs), value)
+    torch.testing.assert_close(sampled_value, value)
     assert agent.get_action(obs).abs().max() < 0.2, "the initial policy is nearly the same everywhere"
 
 
 def test_memory_format_changes_speed_alone(device):
-    envs = batched_env.make_envs(SMALL_IMAGES, None, device=device)
+    envs = batched_env.make_envs(SMALL_IMAGES, 16, 0, device=device)
     obs, _ = envs.reset(seed=list(range(16)))
     values = []
     for channels_last in (False, True):
@@ -214,7 +260,7 @@ def test_memory_format_changes_speed_alone(device):
 
 
 def test_mixed_precision_is_near(device):
-    envs = batched_env.make_envs(SMALL_IMAGES, None, device=device)
+    envs = batched_env.make_envs(SMALL_IMAGES, 16, 0, device=device)
     obs, _ = envs.reset(seed=list(range(16)))
     torch.manual_seed(0)
     agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, SMALL_IMAGES).to(device)
@@ -364,6 +410,35 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
     assert ppo_rgb.main([*map(str, flags)]) == 0
     assert json.loads((run / "eval.json").read_text())["episode_len"] == 8
     assert (run / "test_videos/seed_0.mp4").exists()
+
+
+@pytest.mark.render
+def test_two_actors_train_from_images(tmp_path):
+    """As a command; each of two processes simulates three environments, and writes what they see for the learner."""
+    flags = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--frame_stack", 2,
+             "--num_envs", 6, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 10,
+             "--total_timesteps", 180, "--num_minibatches", 2, "--eval_freq", 2, "--no-capture_video", "--no-cuda",
+             "--env_kwargs", '{"max_episode_steps": 8}', "--exp_name", "two")  # fmt: skip
+    process = run_script(*flags, cwd=tmp_path, script=SCRIPT)
+    assert process.returncode == 0 and process.stderr == "", process.stderr
+    rows = read_metrics(tmp_path / "runs/two")
+    train, evaluation = [[row for row in rows if row["kind"] == kind] for kind in ("train", "eval")]
+    assert [row["global_step"] for row in train] == [60, 120, 180] and all(row["num_episodes"] >= 6 for row in train)
+    assert [row["num_episodes"] for row in evaluation] == [4, 4, 4] and evaluation[0]["episode_len"] == 8
+    assert not any(row["update_skipped"] for row in train) and all(row["actors_memory_mb"] > 0 for row in train)
+
+
+def test_too_little_shared_memory_is_refused_before_anything_is_built(in_tmp, capsys, monkeypatch):
+    """What a container has by default: more than that would end in a bare "Bus error"."""
+    args, usage = "--num_envs 32 --num_steps 50 --no-cuda", shutil.disk_usage("/")
+    monkeypatch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=64 * 2**20))
+    monkeypatch.setattr(ppo_rgb, "train", lambda args, closing: 7)  # where it gets that far
+    line = refused([*args.split(), "--num_actors", "2"], capsys, ppo_rgb)
+    assert "needs 91 MiB of shared memory, and 64 are free" in line
+    assert all(remedy in line for remedy in ("--shm-size", "fewer environments", "--num_actors 1"))
+    for enough in ("--num_actors 1", "--num_actors 2 --num_envs 16", "--num_actors 2 --camera_width 64"):
+        assert ppo_rgb.main([*args.split(), *enough.split()]) == 7
 
 
 def test_without_vulkan_it_says_what_to_install(tmp_path):
