@@ -2087,7 +2087,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         best_score = max(best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(1)  # in rollouts idle threads would spin on cores that the simulation needs
-    seed_all(args.seed)
+    seed_all(args.seed)  # for tasks that draw while they are built
 
     actors = Actors(share, run_dir / "videos")
     closing.callback(actors.close)
@@ -2098,6 +2098,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         fail(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives each a "
              "process of its own; or reset all together: --no-partial_reset")  # fmt: skip
 
+    seed_all(args.seed)  # the same weights however many environments drew something
     agent = Agent(obs_space, action_space, args).to(device)
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
     critic = [p for name, p in agent.named_parameters() if name.startswith("critic")]
@@ -2316,7 +2317,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
         # --- rollout: num_steps in every environment, of all actors at once ---
         start = time.perf_counter()
-        restart = iteration == first_iteration or rebuild and iteration % args.checkpoint_freq == 0
+        boundary = (args.exact_resume or rebuild) and iteration % args.checkpoint_freq == 0
+        restart = iteration == first_iteration or boundary
         if acting_agent is not agent:
             acting_agent.load_state_dict(agent.state_dict())
         results = actors.call("rollout", iteration, restart, restart and rebuild)
