@@ -68,6 +68,15 @@ def make(env_id, num_envs, **kwargs):
     return gym.make(env_id, num_envs=num_envs, sim_backend="physx_cpu", **kwargs).unwrapped
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """For what is so small; pytest runs several processes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture
 def build():
     """`make`, for environments that are closed in the end."""
