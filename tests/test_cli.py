@@ -58,9 +58,9 @@ def test_tensorboard_holds_the_same_numbers(trained):
 
 def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, capsys):
     folder, *_ = trained
-    command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video")
+    command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video", "--num_actors", 1)
     monkeypatch.chdir(tmp_path)
-    assert ppo.main([*map(str, command), "--num_actors", "1", "--num_eval_episodes", "5", "--eval-seed", "100"]) == 0
+    assert ppo.main([*map(str, command), "--num_eval_episodes", "5", "--eval-seed", "100"]) == 0
     output = capsys.readouterr().out
     results = json.loads((folder / "eval.json").read_text())
     assert results["num_episodes"] == 5 and results["eval_seed"] == 100
@@ -69,7 +69,7 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
         assert low <= results[key] <= high and f"{results[key]:.3f}" in output
     assert not list(tmp_path.iterdir()), "nothing is written but beside the checkpoint"
     # the last evaluation of the training run, once more; PhysX remembers contacts of the episodes before
-    assert ppo.main([*map(str, command), "--num_actors", "2", "--num_eval_envs", "2"]) == 0
+    assert ppo.main([*map(str, command), "--num_eval_episodes", "6", "--num_eval_envs", "2"]) == 0
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     results = json.loads((folder / "eval.json").read_text())
     assert {k: results[k] for k in ("return", "success_once")} == pytest.approx(
@@ -290,7 +290,8 @@ def test_videos_and_trajectories(in_tmp, capfd):
     assert list((run / "videos").glob("trajectory_1.state*.h5")), "the replayed trajectory"
 
     # --evaluate films the first four episodes
-    flags = ("--evaluate", "--checkpoint", run / "last.pt", "--num_actors", 1, "--eval_seed", 7, "--no-cuda")
+    flags = ("--evaluate", "--checkpoint", run / "last.pt", "--num_actors", 1, "--num_eval_envs", 1, "--no-cuda",
+             "--num_eval_episodes", 1, "--eval_seed", 7)  # fmt: skip
     assert ppo.main([*map(str, flags)]) == 0
     videos = [run / f"test_videos/seed_{seed}.mp4" for seed in range(7, 11)]
     assert sorted((run / "test_videos").iterdir()) == sorted(videos)

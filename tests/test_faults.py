@@ -68,6 +68,18 @@ def test_exact_resume_is_bit_identical(train, in_update, in_tmp, iteration, acti
     assert len(metrics) == 12 + 4 and len(scalars("runs/run2")["train/value_loss"]) == 12
 
 
+def test_exact_resume_with_gpu_simulation(train, in_update, in_tmp, monkeypatch, device):
+    """Where scenes are not built anew: episodes start at the same iterations, stopped or not."""
+    monkeypatch.setattr(ppo, "choose_device", lambda args: device)
+    flags = RUN | dict(exact_resume=True, sim_backend="physx_cuda")
+    train(**flags)
+    in_update(5, crash)
+    with pytest.raises(Stop):
+        train(**flags)
+    train(**flags, resume="runs/run2")
+    assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
+
+
 def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
     """From every checkpoint of a whole run the same end is reached; and its boundaries do restart the episodes."""
     train(**RUN | dict(save_freq=3), exact_resume=True)
