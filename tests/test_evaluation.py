@@ -26,8 +26,9 @@ ARGS = ppo.Args(
 )  # fmt: skip
 
 
-def evaluate_with(args, agent, monkeypatch):
-    """The evaluation by all actors of a run, here one after the other: first observations and metrics."""
+def evaluate_with(args, agent, monkeypatch, again=False):
+    """The evaluation by all actors of a run, here one after the other: first observations and metrics. `again`: those
+    of a second evaluation in the same scenes."""
     start_episodes, first_obs, parts = ppo.start_episodes, [], []
     for index in range(args.num_actors):
         of_actor = []
@@ -38,6 +39,8 @@ def evaluate_with(args, agent, monkeypatch):
 
         actor = ppo.Actor(args, index)
         actor.connect(agent)
+        if again:
+            actor.evaluate(EPISODES, SEED, STEPS, ppo.rebuilding(args))
         monkeypatch.setattr(ppo, "start_episodes", spy)
         parts.append(actor.evaluate(EPISODES, SEED, STEPS, ppo.rebuilding(args)))
         monkeypatch.undo()
@@ -81,7 +84,7 @@ def by_row(function):
     [k if k in ("PushCube-v1", "MS-CartpoleBalance-v1") else pytest.param(k, marks=pytest.mark.slow) for k in TASKS],
 )
 def test_independent_of_environments_and_actors(env_id, monkeypatch):
-    """Rounds that follow each other in the same scenes, and a last one that is not full, change nothing."""
+    """Nor does it matter what was played in the same scenes before, or whether the last round is full."""
     args = replace(ARGS, env_id=env_id, control_mode=TASKS[env_id])
     env = ppo.make_env(args, 1)
     agent = make_agent(
@@ -92,9 +95,9 @@ def test_independent_of_environments_and_actors(env_id, monkeypatch):
     agent.get_action = by_row(agent.get_action)
     first_obs, metrics = plain_loop(args, agent)
     assert len(metrics["return"].unique()) == EPISODES
-    for num_envs, num_actors in ((1, 1), (3, 1), (5, 1), (4, 2), (2, 2)):
+    for num_envs, num_actors, again in ((1, 1, False), (3, 1, False), (5, 1, True), (4, 2, False), (2, 2, False)):
         of_run = replace(args, num_eval_envs=num_envs, num_actors=num_actors)
-        ours = evaluate_with(of_run, agent, monkeypatch)
+        ours = evaluate_with(of_run, agent, monkeypatch, again)
         torch.testing.assert_close(ours[0], first_obs, rtol=0, atol=1e-6)
         assert ours[1].keys() == metrics.keys()
         for key, values in metrics.items():
@@ -142,10 +145,10 @@ def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
     if num_steps == 20 and not ends_early:
         assert wanted["success_once"] != wanted["success_at_end"] and wanted["fail_once"] != wanted["fail_at_end"]
     for num_envs in (1, 7, 64):
-        envs = ppo.ManiSkillVectorEnv(
-            Reach(num_envs), auto_reset=False, ignore_terminations=not ends_early, record_metrics=True
-        )
+        spy = Spy(Reach(num_envs))
+        envs = ppo.ManiSkillVectorEnv(spy, auto_reset=False, ignore_terminations=not ends_early, record_metrics=True)
         metrics = ppo.evaluate(agent, envs, 40, SEED, num_steps)
+        assert len(spy.steps) == math.ceil(40 / num_envs) * num_steps, "none is simulated for nothing"
         assert metrics.keys() == wanted.keys()
         for key, values in wanted.items():
             assert metrics[key].tolist() == pytest.approx(values, rel=1e-3), key

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from batched_env import BatchedReach
-from conftest import SMALL
+from conftest import SMALL, box
 from test_rollout import gae_of_episodes
 
 import ppo
@@ -151,6 +151,21 @@ def test_a_remainder_sits_out_at_random(run):
     assert len({frozenset(x) for x in left_out}) > 1
 
 
+def test_gradients_of_earlier_minibatches_are_gone():
+    torch.manual_seed(0)
+    agent = ppo.Agent(box(4), box(2), ARGS)
+    used = copy.deepcopy(agent)
+    obs, actions = torch.randn(8, 4), torch.randn(8, 2)
+    with torch.no_grad():
+        logprobs = agent.get_action_and_value(obs, actions)[1]
+    batch = [obs, actions, logprobs, torch.randn(8), torch.randn(8), torch.randn(8)]
+    for parameter in used.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    for x in (agent, used):
+        ppo.update_minibatch(x, torch.optim.SGD(x.parameters(), lr=0.1), ARGS, *batch)
+    assert all(torch.equal(*pair) for pair in zip(agent.parameters(), used.parameters()))
+
+
 def test_learning_rates(run):
     """They fall linearly, from the peak in the first iteration to one part of it in the last, or stay."""
     for anneal_lr in (True, False):
@@ -186,7 +201,10 @@ def test_the_first_epoch_beyond_target_kl_is_the_last(run):
     """By the mean over an epoch's minibatches; the threshold lies between what the epochs of a longer run had."""
 
     def divergences(record):
-        kl = [[update["metrics"][ppo.KL].item() for update in i["updates"]] for i in record.iterations]
+        kl = [
+            [update["metrics"][ppo.UPDATE_METRICS.index("approx_kl")].item() for update in i["updates"]]
+            for i in record.iterations
+        ]
         return [np.mean(np.reshape(x, (-1, 4)), axis=1).tolist() for x in kl]
 
     flags = dict(update_epochs=6, learning_rate=3e-3)
@@ -218,8 +236,8 @@ def test_each_rollout_acts_with_what_was_learned_before_it(run):
 
 def test_evaluations(run):
     """Always the same episodes, without exploration, at the steps that the rows name."""
-    record = run(eval_seed=70, eval_freq=2)
-    assert [row["global_step"] for row in record.eval_rows] == [0, 96, 192]
+    record = run(eval_seed=70, eval_freq=3)
+    assert [row["global_step"] for row in record.eval_rows] == [0, 144, 192], "the final policy is evaluated too"
     for evaluation in record.evaluations:
         num_episodes, seed, num_steps, rebuild, separately = evaluation["arguments"]
         assert (num_episodes, seed, num_steps, rebuild, separately) == (3, 70, 5, 0, True)

@@ -64,18 +64,18 @@ class Spy(gym.Wrapper):
 
 def make_agent(obs_space, action_space, args):
     """An agent far from the initial one: it acts beyond the bounds, and its values differ from state to state."""
-    torch.manual_seed(3)
-    agent = ppo.Agent(obs_space, action_space, args)
-    with torch.no_grad():
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(3)
+        agent = ppo.Agent(obs_space, action_space, args)
         agent.actor_mean.weight *= 40
         agent.critic.weight *= 3
         agent.critic.bias += 2
         agent.actor_logstd += 0.3 * torch.randn_like(agent.actor_logstd)
-    if args.norm_obs:
-        size = len(agent.obs_mean)
-        scale = torch.linspace(0.5, 2, size)
-        scale[1] = 0.02  # so small that normalised observations reach the limit of 10
-        agent.update_normalization(torch.randn(500, size) * scale + torch.linspace(-1, 1, size))
+        if args.norm_obs:
+            size = len(agent.obs_mean)
+            scale = torch.linspace(0.5, 2, size)
+            scale[1] = 0.02  # so small that normalised observations reach the limit of 10
+            agent.update_normalization(torch.randn(500, size) * scale + torch.linspace(-1, 1, size))
     return agent
 
 
@@ -283,6 +283,7 @@ def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=not partial_reset, record_metrics=True)
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
     obs, _ = envs.reset(seed=[5, 6, 7])
+    torch.manual_seed(0)
     episodes = [fresh_episode() for _ in range(args.num_envs)]
     for _ in range(2):
         spy.steps.clear()
