@@ -362,11 +362,13 @@ def test_partial_reset(build, control_mode):
         for _ in range(3):
             env.step(sample(env, rng))
         before, goals = [physics(env, i) for i in range(4)], env.goal_site.pose.p.clone()
+        steps = env.elapsed_steps.clone()
+        assert (steps >= 3).all()
         obs, _ = env.reset(options=dict(env_idx=torch.tensor(env_idx)))
         for i in range(4):
             assert (physics(env, i) == before[i]) == (i not in env_idx)
             assert torch.equal(env.goal_site.pose.p[i], goals[i]) == (i not in env_idx)
-            assert env.elapsed_steps[i] == (0 if i in env_idx else 3 + env.elapsed_steps[i] - 3)
+            assert env.elapsed_steps[i] == (0 if i in env_idx else steps[i])
         assert (obs["agent"]["qvel"][env_idx] == 0).all()
         assert (obs["agent"]["qpos"][env_idx] - torch.tensor(env.agent.keyframes["rest"].qpos)).abs().max() < 0.2
 
