@@ -1008,6 +1008,7 @@ class Actor:
         if not args.evaluate:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
             self.envs = make_envs(args, len(self.env_idx), seed)
+            self.resets_some = can_reset_some(self.envs)
         record = None
         if args.save_trajectory and trajectory_dir:
             record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
@@ -1043,8 +1044,8 @@ class Actor:
             return sums, None
         names = [name for name, row in zip(checked, finite) if not row.all()]
         broken = (~finite.all(0)).nonzero().flatten()
-        # scenes that ManiSkill rebuilds now and then are so all at once
-        self.obs, _ = self.envs.reset(options=None if args.reconfiguration_freq else dict(env_idx=broken))
+        some = self.resets_some and not args.reconfiguration_freq  # ManiSkill rebuilds scenes all at once
+        self.obs, _ = self.envs.reset(options=dict(env_idx=broken) if some else None)
         env_idx = (broken.cpu() + self.env_idx.start).tolist()
         return sums, f"non-finite {', '.join(names)} in environments {env_idx}"
 
@@ -1529,7 +1530,7 @@ def add_scalars(writer, row: dict) -> None:
 def open_tensorboard(run_dir: Path):
     """A writer of TensorBoard events that begins with what metrics.jsonl holds: of a resumed run no row is missing, and
     none is there twice."""
-    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the workers need none
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and the actors need none
 
     for old in run_dir.glob("events.out.tfevents.*"):
         old.unlink()
@@ -1827,7 +1828,7 @@ def rollout(agent, envs, storage: dict, obs, args: Args, sample_action):
 def train(args: Args, closing: contextlib.ExitStack) -> int:
     """The training run, from the folder to the last checkpoint; the loop stands here in one piece.
 
-    However it ends from there on, `closing` keeps what was learned and ends the workers. Returns the exit code."""
+    However it ends from there on, `closing` keeps what was learned and ends the actors. Returns the exit code."""
     # --- environments, agent ---
     for s in STOP_SIGNALS:
         closing.callback(signal.signal, s, signal.getsignal(s))
@@ -1863,7 +1864,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     envs = actors.local.envs
     obs_space, action_space = envs.single_observation_space, envs.single_action_space
     ends_early = share.partial_reset and {"success", "fail"} & envs.reset()[1].keys()
-    if ends_early and not can_reset_some(envs):
+    if ends_early and not actors.local.resets_some:
         fail(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives each a "
              "process of its own; or reset all together: --no-partial_reset")  # fmt: skip
 
@@ -1914,6 +1915,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     # --- logging ---
     run_dir.mkdir(parents=True, exist_ok=True)
+    metrics_file, writer = open_metrics(run_dir), None
     packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
     about = {
         "args": asdict(args),
@@ -1921,7 +1923,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{num_cores()} CPU core(s)",
         "command": shlex.join(sys.argv),
     }
-    (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
     wandb, wandb_id = None, resumed.get("wandb_id")
     if share.track:
         import wandb
@@ -1931,7 +1932,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             config=about, save_code=True, id=wandb_id, resume="allow",
         ).id  # fmt: skip
         closing.push(lambda error, *_: wandb.finish(exit_code=int(error is not None)))
-    metrics_file, writer = open_metrics(run_dir), None
+    (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
     kept = (run_dir / "metrics.jsonl").read_bytes()[: resumed.get("metrics_size", 0)]  # later steps are done again
     metrics_file.truncate(kept.rfind(b"\n") + 1)
     metrics_file.seek(0, os.SEEK_END)

@@ -5,7 +5,7 @@
 
 Each process has `--num_envs` environments, so that the work grows with their number. The numbers take turns, several
 repetitions of each, since a shared machine drifts: compare ratios. On a machine without a GPU one process uses all
-cores already, through its workers: there the table shows what several cost, not what they gain.
+cores already, through its actors: there the table shows what several cost, not what they gain.
 """
 
 import argparse

@@ -119,7 +119,7 @@ def main():
 
     all_cores = sorted(os.sched_getaffinity(0))
     for cores in options.cores:
-        os.sched_setaffinity(0, all_cores[:cores])  # which the workers inherit
+        os.sched_setaffinity(0, all_cores[:cores])  # as its actors do
         compare(options)
 
 
