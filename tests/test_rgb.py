@@ -305,11 +305,17 @@ def test_all_options_train(train):
 
 @pytest.mark.slow
 def test_learns_from_images(train):
-    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just beside it."""
+    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just beside it, so that 32
+    evaluation episodes differ by 0.1 with the rounding of another number of threads. Training ends hundreds."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
     metrics, *_ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
-    assert first["success_once"] < 0.1 and last["success_once"] >= 0.6
+    assert first["success_once"] < 0.1 and last["success_once"] >= 0.4
+    early, late = [
+        sum(row["success_once"] * row["num_episodes"] for row in rows) / sum(row["num_episodes"] for row in rows)
+        for rows in (metrics[1:3], metrics[-9:-1])
+    ]
+    assert early < 0.2 and late >= 0.8
 
 
 def test_exact_resume_is_bit_identical(train, in_update, in_tmp):
