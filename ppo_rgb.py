@@ -1071,9 +1071,7 @@ def part(total: int, index: int, parts: int) -> range:
 
 
 class Actor:
-    """The environments of one process: their part of training, and their part of each evaluation.
-
-    Raises SystemExit, with one line, if the task cannot do what is asked of it."""
+    """The environments of one process: their part of training, and their part of each evaluation."""
 
     def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
         self.args, self.index = args, index
