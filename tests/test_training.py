@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import batched_env
 import pytest
@@ -180,3 +181,29 @@ def test_a_real_task(in_tmp):
     assert len(episodes) == 12 and all(e["elapsed_steps"] == 10 for e in episodes), (
         "two evaluations of two rounds of three"
     )
+
+
+@pytest.mark.gpu
+def test_cpu_simulation_feeds_a_gpu_learner(in_tmp, monkeypatch):
+    """The agent's copy on the CPU acts: the first rollout is that of a CPU learner, and the second one follows the
+    weights that the GPU has learned."""
+    monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
+    rollout, copies = ppo.rollout, []
+
+    def spy(agent, *others):
+        copies.append({k: v.clone() for k, v in agent.state_dict().items()})
+        return rollout(agent, *others)
+
+    monkeypatch.setattr(ppo, "rollout", spy)
+    rows = []
+    for cuda in (False, True):
+        args = replace(SMALL, exp_name=f"cuda{cuda}", cuda=cuda, save_freq=1, num_steps=20, total_timesteps=32 * 20 * 2)
+        with contextlib.ExitStack() as closing:
+            assert ppo.train(args, closing) == 0
+        rows.append([row for row in read_metrics(in_tmp / f"runs/cuda{cuda}") if row["kind"] == "train"])
+    on_cpu, on_gpu = rows
+    for key in ("return", "num_episodes", "explained_variance"):
+        assert on_gpu[0][key] == pytest.approx(on_cpu[0][key], rel=1e-3), key
+    learned = ppo.load_checkpoint("runs/cudaTrue/iteration_1.pt")
+    assert all(x.device.type == "cpu" for x in copies[-1].values())
+    assert same_weights(learned, {"agent": copies[-1]})
