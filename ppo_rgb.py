@@ -2393,7 +2393,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             print(f"step {global_step:>9,}  training: {status}", flush=True)
             last_line = time.monotonic()
 
-        if args.save_train_video_freq and share.save_train_video_freq and iteration % args.save_train_video_freq == 0:
+        if share.save_train_video_freq and iteration % share.save_train_video_freq == 0:
             train_film.record(acting_agent, f"step_{global_step:09d}", max_eval_steps, args.eval_seed, exploring=True)
 
     if not finished:
