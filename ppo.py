@@ -218,6 +218,8 @@ class Args:
     """Adam's learning rate (on a CPU: 1e-3)"""
     critic_learning_rate: Optional[float] = None
     """learning rate of the critic's layers (None: learning_rate)"""
+    logstd_lr_factor: float = 1.0
+    """learning rate of the policy's standard deviation, in multiples of learning_rate (on a CPU: 20)"""
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
     anneal_lr: bool = False
@@ -589,24 +591,35 @@ class Film:
 # ----- Batched CPU simulation -----------------------------------------------------------------------------------------
 
 
+ALL, NO_ROWS = slice(None), torch.zeros(0, 1, dtype=torch.bool)
+
+
 class Array:
     """What SAPIEN's CUDA arrays are to ManiSkill: something with .torch(). `refresh` fills an outdated one."""
 
     def __init__(self, *shape: int, refresh=None):
-        self.data = torch.zeros(shape)
+        with torch.inference_mode(False):  # in which a tensor has no version
+            self.data = torch.zeros(shape)
         self.applied = torch.zeros(shape)  # what the simulation has of it
+        self.version = None  # of the tensor when the simulation had all of it: torch counts the writes
         self.refresh, self.outdated = refresh, False
 
-    def fetch(self, rows, columns, values: torch.Tensor) -> None:
+    def fetch(self, values: torch.Tensor, rows=ALL, columns=ALL) -> None:
         self.data[rows, columns] = values
         self.applied[rows, columns] = values
+        if rows is columns is ALL:
+            self.version = self.data._version
 
-    def changes(self, rows=slice(None), columns=slice(None)) -> torch.Tensor:
-        """Where the tensor was written since it was fetched or applied: bool, of these rows and columns. What was not
-        written is left alone in the simulation, to the last bit."""
+    def changes(self, rows=ALL, columns=ALL) -> torch.Tensor:
+        """Where the tensor was written since it was fetched or applied: bool, of these rows and columns, and of no row
+        if nothing was. What was not written is left alone in the simulation, to the last bit."""
+        if self.data._version == self.version:
+            return NO_ROWS
         changed = self.data[rows, columns] != self.applied[rows, columns]
         if changed.any():
             self.applied[rows, columns] = self.data[rows, columns]
+        if rows is columns is ALL:
+            self.version = self.data._version
         return changed
 
     def torch(self):
@@ -643,6 +656,11 @@ class BatchedPhysx:
     def gpu_init(self) -> None:
         self.free = [body for system in self.systems for body in system.rigid_dynamic_components]
         self.links = [link for system in self.systems for link in system.articulation_link_components]
+        numbered = list(enumerate(self.systems))
+        self.scene_of_free = [i for i, system in numbered for _ in system.rigid_dynamic_components]
+        self.scene_of_articulation = [
+            i for i, system in numbered for link in system.articulation_link_components if link.is_root
+        ]
         self.articulations = [link.articulation for link in self.links if link.is_root]
         self.joints = [articulation.active_joints for articulation in self.articulations]
         self.row = {body: i for i, body in enumerate(self.free + self.links)}
@@ -679,7 +697,8 @@ class BatchedPhysx:
             positions = joints_at[i] + torch.arange(articulation.dof)
             self.joint_columns[0, i, : articulation.dof] = positions
             self.joint_columns[1, i, : articulation.dof] = positions + articulation.dof
-        self.num_packed_poses, self.moved, self.contacts = None, True, None
+        self.states, self.poses, self.pose_sizes = [b""] * len(numbered), [b""] * len(numbered), None
+        self.moved, self.contacts = set(range(len(numbered))), None
         self.gpu_fetch_rigid_dynamic_data()
         self.gpu_fetch_articulation_link_pose()
         self.gpu_fetch_articulation_qpos()
@@ -690,28 +709,29 @@ class BatchedPhysx:
         self.gpu_apply_articulation_target_velocity()
         for system in self.systems:
             system.step()
-        self.moved, self.contacts = True, None
+        self.moved, self.contacts = set(range(len(self.systems))), None
 
     # --- from the simulation to the tensors ---
 
     def _pack(self) -> None:
-        """Read the whole state of all scenes, unless nothing has moved since."""
+        """Read the whole state of the scenes in which something has moved since."""
         if not self.moved:
             return
-        self.moved = False
+        for i in self.moved:
+            self.states[i], self.poses[i] = self.systems[i].pack(), self.scenes[i].pack_poses()
+        self.moved = set()
         self.cuda_articulation_qacc.outdated = True
-        packed = bytearray().join([*(system.pack() for system in self.systems), bytes(4)])
-        self.packed = torch.frombuffer(packed, dtype=torch.float32)
-        packed_poses = [scene.pack_poses() for scene in self.scenes]
-        if sum(map(len, packed_poses)) != self.num_packed_poses:  # lights and cameras may be added at any time
-            self._find_links([len(poses) // 4 for poses in packed_poses])
-            self.num_packed_poses = sum(map(len, packed_poses))
+        self.packed = torch.frombuffer(bytearray().join([*self.states, bytes(4)]), dtype=torch.float32)
+        if [*map(len, self.poses)] != self.pose_sizes:  # lights and cameras may be added at any time
+            self._find_links()
         if self.links:
-            self.packed_poses = torch.frombuffer(bytearray().join(packed_poses), dtype=torch.float32)
+            self.packed_poses = torch.frombuffer(bytearray().join(self.poses), dtype=torch.float32)
 
-    def _find_links(self, sizes: list[int]) -> None:
+    def _find_links(self) -> None:
         """Where each link's pose stands in what pack_poses() returns: quaternion and position of each entity."""
-        starts = np.cumsum([0, *sizes])
+        self.poses = [scene.pack_poses() for scene in self.scenes]
+        self.pose_sizes = [*map(len, self.poses)]
+        starts = np.cumsum([0, *self.pose_sizes]) // 4
         entity_at = {}
         for scene, start in zip(self.scenes, starts):
             entity_at |= {entity: start + 7 * i for i, entity in enumerate(scene.entities)}
@@ -720,18 +740,18 @@ class BatchedPhysx:
 
     def gpu_fetch_rigid_dynamic_data(self) -> None:
         self._pack()
-        self.cuda_rigid_body_data.fetch(slice(0, len(self.free)), slice(None), self.packed[self.free_columns])
+        self.cuda_rigid_body_data.fetch(self.packed[self.free_columns], slice(0, len(self.free)))
 
     def gpu_fetch_articulation_link_pose(self) -> None:
         self._pack()
         if self.links:
             poses = self.packed_poses[self.link_columns]
-            self.cuda_rigid_body_data.fetch(slice(len(self.free), None), slice(0, 7), poses)
+            self.cuda_rigid_body_data.fetch(poses, slice(len(self.free), None), slice(0, 7))
 
     def gpu_fetch_articulation_link_velocity(self) -> None:
         """Of the roots; `read_velocities` gets those of other links, for which few tasks ask."""
         self._pack()
-        self.cuda_rigid_body_data.fetch(self.root_rows, slice(7, 13), self.packed[self.root_columns])
+        self.cuda_rigid_body_data.fetch(self.packed[self.root_columns], self.root_rows, slice(7, 13))
 
     def read_velocities(self, links: list) -> None:
         links = [link for link in links if not link.is_root]
@@ -742,11 +762,11 @@ class BatchedPhysx:
 
     def gpu_fetch_articulation_qpos(self) -> None:
         self._pack()
-        self.cuda_articulation_qpos.fetch(slice(None), slice(None), self.packed[self.joint_columns[0]])
+        self.cuda_articulation_qpos.fetch(self.packed[self.joint_columns[0]])
 
     def gpu_fetch_articulation_qvel(self) -> None:
         self._pack()
-        self.cuda_articulation_qvel.fetch(slice(None), slice(None), self.packed[self.joint_columns[1]])
+        self.cuda_articulation_qvel.fetch(self.packed[self.joint_columns[1]])
 
     def _read_qacc(self) -> None:
         for articulation, row in zip(self.articulations, self.cuda_articulation_qacc.data):
@@ -766,14 +786,14 @@ class BatchedPhysx:
                 body.pose = sapien.Pose(row[:3], row[3:7])
             if not body.kinematic and changed[i, 7:].any():
                 body.linear_velocity, body.angular_velocity = row[7:10], row[10:13]
-            self.moved = True
+            self.moved.add(self.scene_of_free[i])
 
     def gpu_apply_articulation_root_pose(self) -> None:
         changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(0, 7))
         for i in changed.any(dim=1).nonzero().flatten().tolist():
             row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
             self.articulations[i].root_pose = sapien.Pose(row[:3], row[3:7])
-            self.moved = True
+            self.moved.add(self.scene_of_articulation[i])
 
     def gpu_apply_articulation_root_velocity(self) -> None:
         changed = self.cuda_rigid_body_data.changes(self.root_rows, slice(7, 13))
@@ -781,13 +801,13 @@ class BatchedPhysx:
             row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
             self.articulations[i].root_linear_velocity = row[7:10]
             self.articulations[i].root_angular_velocity = row[10:13]
-            self.moved = True
+            self.moved.add(self.scene_of_articulation[i])
 
     def _apply(self, name: str) -> None:
         array = getattr(self, f"cuda_articulation_{name}")
         for i in array.changes().any(dim=1).nonzero().flatten().tolist():
             setattr(self.articulations[i], name, array.data[i, : self.articulations[i].dof].numpy())
-            self.moved = True
+            self.moved.add(self.scene_of_articulation[i])
 
     def gpu_apply_articulation_qpos(self) -> None:
         self._apply("qpos")
@@ -1196,7 +1216,7 @@ class Agent(nn.Module):
         self.critic_features = self.actor_features if args.shared_features else features()
         self.actor_mean = layer_init(nn.Linear(256, act_dim), std=0.01 * math.sqrt(2))
         self.actor_logstd = nn.Parameter(torch.full((1, act_dim), args.logstd_init))
-        self.critic = layer_init(nn.Linear(256, 1))
+        self.critic = layer_init(nn.Linear(256, 1), std=0.01)
         self.norm_obs = args.norm_obs
         self.register_buffer("obs_mean", torch.zeros(obs_dim))
         self.register_buffer("obs_var", torch.ones(obs_dim))
@@ -1569,8 +1589,8 @@ LIMITS = (  # of numbers that are given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
               "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
-    (0, 1e18, "seed critic_learning_rate ent_coef vf_coef target_kl eval_freq eval_seed reconfiguration_freq "
-              "eval_reconfiguration_freq"),
+    (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq eval_seed "
+              "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
     (-20, 5, "logstd_init"),
 )  # fmt: skip
@@ -1816,8 +1836,7 @@ def rollout(agent, envs, storage: dict, obs, args: Args, sample_action):
                     final_infos[f"final_{key}"] = value
             for key, value in final_infos.items():
                 sums[key] = sums.get(key, 0.0) + torch.where(done, value.float(), 0.0).sum()
-    for step in range(args.num_steps):  # no step had to wait for them
-        storage["values"][step] = agent.get_value(storage["obs"][step])
+    storage["values"].copy_(agent.get_value(storage["obs"].flatten(0, 1)).view_as(storage["values"]))
     following = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
     storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following))
     return obs, sums
@@ -1868,10 +1887,16 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     seed_all(args.seed)  # the same weights however many environments drew something
     agent = Agent(obs_space, action_space, args).to(device)
-    critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
-    critic = [p for name, p in agent.named_parameters() if name.startswith("critic")]
-    actor = [p for name, p in agent.named_parameters() if not name.startswith("critic")]  # with features they share
-    groups = [{"params": p, "lr": lr, "peak_lr": lr} for p, lr in ((actor, args.learning_rate), (critic, critic_lr))]
+    lr = args.learning_rate
+    critic_lr = lr if args.critic_learning_rate is None else args.critic_learning_rate
+    named = [*agent.named_parameters()]
+    groups = [
+        {"params": [p for name, p in named if not name.startswith(("critic", "actor_logstd"))], "lr": lr},
+        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
+        {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
+    ]
+    for group in groups:
+        group["peak_lr"] = group["lr"]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
 
     def load_optimizer(state: dict) -> None:

@@ -1,4 +1,4 @@
-"""Train on the torch-native environments, once undisturbed and once killed thirty times at random moments.
+"""Train on the torch-native environments, once undisturbed and once killed twenty times at random moments.
 
 Forked children spare each attempt the imports; this process itself computes nothing, so that the fork is safe."""
 
@@ -20,7 +20,7 @@ import ppo
 
 ARGS = dict(
     sim_backend="physx_cpu", num_envs=16, num_eval_envs=8, num_actors=1, num_eval_episodes=8, num_steps=10,
-    total_timesteps=16 * 10 * 220, num_minibatches=2, update_epochs=1, eval_freq=25, capture_video=False, cuda=False,
+    total_timesteps=16 * 10 * 150, num_minibatches=2, update_epochs=1, eval_freq=25, capture_video=False, cuda=False,
     norm_obs=True, anneal_lr=True, checkpoint_freq=3, exact_resume=True,
 )  # fmt: skip
 
@@ -47,7 +47,7 @@ if __name__ == "__main__":
     random.seed(0)
     assert os.waitpid(attempt(exp_name="whole"), 0)[1] == 0
     metrics, progress = Path("runs/killed/metrics.jsonl"), []
-    for _ in range(30):
+    for _ in range(20):
         rows = metrics.read_bytes().count(b"\n") if metrics.exists() else 0
         pid, goal = resume_or_start(), rows + random.randrange(10)
         deadline = time.monotonic() + 20
@@ -56,9 +56,9 @@ if __name__ == "__main__":
             time.sleep(0.002)
         time.sleep(random.uniform(0.0, 0.05))  # an iteration takes about so long
         os.kill(pid, signal.SIGKILL)
-        assert os.waitpid(pid, 0)[1] == signal.SIGKILL, "the run ended before its thirtieth death"
+        assert os.waitpid(pid, 0)[1] == signal.SIGKILL, "the run ended before its twentieth death"
         if Path("runs/killed/last.pt").exists():
             progress.append(ppo.load_checkpoint("runs/killed/last.pt")["iteration"])  # readable at any instant
     assert os.waitpid(resume_or_start(), 0)[1] == 0
-    assert progress == sorted(progress) and len(set(progress)) > 12
-    print(f"30 kills, the last at iteration {progress[-1]}")
+    assert progress == sorted(progress) and len(set(progress)) > 8
+    print(f"20 kills, the last at iteration {progress[-1]}")

@@ -589,21 +589,21 @@ def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch, num_envs, nu
 
 @pytest.mark.slow
 def test_kill_at_random_moments(tmp_path):
-    """kill -9 thirty times: at any instant there is a readable checkpoint or none yet; in the end the run is whole and
+    """kill -9 twenty times: at any instant there is a readable checkpoint or none yet; in the end the run is whole and
     equal to one that was never killed."""
     process = subprocess.run(
         [sys.executable, str(Path(__file__).parent / "killed_run.py")], cwd=tmp_path, capture_output=True, text=True,
         timeout=600,
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
-    assert "30 kills" in process.stdout
+    assert "20 kills" in process.stdout
     assert same_run(tmp_path / "runs/whole", tmp_path / "runs/killed")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_iterations, flags", [(2000, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
+@pytest.mark.parametrize("num_iterations, flags", [(800, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
 def test_memory_is_flat(tmp_path, num_iterations, flags):
-    """Over 2,000 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
+    """Over 800 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
     flags = (*flags, "--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
              "--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 2,
              "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-capture_video", "--no-cuda",
@@ -615,4 +615,4 @@ def test_memory_is_flat(tmp_path, num_iterations, flags):
     for key in ("memory_mb", "actors_memory_mb"):
         quarter = num_iterations // 4
         early, late = [sum(row[key] for row in part) / len(part) for part in (rows[quarter:][:20], rows[-20:])]
-        assert late - early < 3, (key, early, late)
+        assert late - early < 2, (key, early, late)

@@ -163,11 +163,13 @@ def test_gradients_of_earlier_minibatches_are_gone():
 def test_learning_rates(run):
     """They fall linearly, from the peak in the first iteration to one part of it in the last, or stay."""
     for anneal_lr in (True, False):
-        record = run(anneal_lr=anneal_lr, critic_learning_rate=5e-3, exp_name=f"anneal_{anneal_lr}")
+        record = run(
+            anneal_lr=anneal_lr, critic_learning_rate=5e-3, logstd_lr_factor=3.0, exp_name=f"anneal_{anneal_lr}"
+        )
         for number, iteration in enumerate(record.iterations):
             factor = 1 - number / ITERATIONS if anneal_lr else 1
             for update in iteration["updates"]:
-                assert update["rates"] == pytest.approx([1e-3 * factor, 5e-3 * factor])
+                assert update["rates"] == pytest.approx([1e-3 * factor, 5e-3 * factor, 3e-3 * factor])
             assert record.train_rows[number]["learning_rate"] == pytest.approx(1e-3 * factor)
 
 
