@@ -191,9 +191,9 @@ class Args:
     render_backend: str = "gpu"
     """where videos are rendered: gpu (gpu:1), cpu or none; what is not there is replaced by what is"""
     num_envs: int = 512
-    """parallel training environments (on a CPU: 16 a core)"""
+    """parallel training environments (on a CPU: 32 a core)"""
     num_eval_envs: int = 16
-    """parallel evaluation environments (on a CPU: 16 a core)"""
+    """parallel evaluation environments (on a CPU: 32 a core)"""
     num_actors: Optional[int] = None
     """processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
@@ -213,7 +213,7 @@ class Args:
 
     # --- PPO ---
     total_timesteps: int = 10_000_000
-    """environment steps in all (on a CPU: 250,000)"""
+    """environment steps in all (on a CPU: 120,000)"""
     learning_rate: float = 3e-4
     """Adam's learning rate (on a CPU: 1e-3)"""
     critic_learning_rate: Optional[float] = None
@@ -229,7 +229,7 @@ class Args:
     gae_lambda: float = 0.9
     """lambda of generalised advantage estimation"""
     num_minibatches: int = 32
-    """minibatches per epoch (on a CPU: 8); where they do not divide the batch, a random remainder sits out"""
+    """minibatches per epoch (on a CPU: 4); where they do not divide the batch, a random remainder sits out"""
     update_epochs: int = 4
     """passes over the batch per iteration (on a CPU: 8)"""
     norm_adv: bool = True
@@ -261,7 +261,7 @@ class Args:
 
     # --- evaluation and checkpoints ---
     eval_freq: int = 25
-    """evaluate every so many iterations (on a CPU: 15), and always before the first and after the last; 0: only then"""
+    """evaluate every so many iterations (on a CPU: 10), and always before the first and after the last; 0: only then"""
     num_eval_episodes: int = 64
     """episodes of an evaluation"""
     num_eval_steps: Optional[int] = None
@@ -330,8 +330,8 @@ class Args:
 
 
 CPU_DEFAULTS = dict(
-    total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    eval_freq=15,
+    total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
+    logstd_lr_factor=20.0, eval_freq=10,
 )  # fmt: skip
 
 # --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
@@ -410,7 +410,7 @@ def parse_args(argv: list[str]) -> Args:
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
         cores = num_cores() * WORLD_SIZE
-        default = replace(default, **CPU_DEFAULTS, num_envs=16 * cores, num_eval_envs=16 * cores)
+        default = replace(default, **CPU_DEFAULTS, num_envs=32 * cores, num_eval_envs=32 * cores)
     if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
@@ -1892,8 +1892,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     named = [*agent.named_parameters()]
     groups = [
         {"params": [p for name, p in named if not name.startswith(("critic", "actor_logstd"))], "lr": lr},
-        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
         {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
+        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
     ]
     for group in groups:
         group["peak_lr"] = group["lr"]

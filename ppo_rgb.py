@@ -188,9 +188,9 @@ class Args:
     render_backend: str = "gpu"
     """where images are rendered: gpu (gpu:1) or cpu; what is not there is replaced by what is"""
     num_envs: int = 256
-    """parallel training environments (on a CPU: 16 a core)"""
+    """parallel training environments (on a CPU: 32 a core)"""
     num_eval_envs: int = 16
-    """parallel evaluation environments (on a CPU: 16 a core)"""
+    """parallel evaluation environments (on a CPU: 32 a core)"""
     num_actors: Optional[int] = None
     """processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
@@ -216,7 +216,7 @@ class Args:
     critic_learning_rate: Optional[float] = None
     """learning rate of the critic's layers (None: learning_rate)"""
     logstd_lr_factor: float = 1.0
-    """learning rate of the policy's standard deviation, in multiples of learning_rate (on a CPU: 20)"""
+    """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
     anneal_lr: bool = False
@@ -416,7 +416,7 @@ def parse_args(argv: list[str]) -> Args:
     default, stored, kept = Args(), {}, ()
     if args.sim_backend == "physx_cpu":
         cores = num_cores() * WORLD_SIZE
-        default = replace(default, **CPU_DEFAULTS, num_envs=16 * cores, num_eval_envs=16 * cores)
+        default = replace(default, **CPU_DEFAULTS, num_envs=32 * cores, num_eval_envs=32 * cores)
     if args.resume is not None:
         if args.evaluate or args.checkpoint:
             fail("--resume continues a run as it was: leave out --evaluate and --checkpoint")
@@ -2124,8 +2124,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     named = [*agent.named_parameters()]
     groups = [
         {"params": [p for name, p in named if not name.startswith(("critic", "actor_logstd"))], "lr": lr},
-        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
         {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
+        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
     ]
     for group in groups:
         group["peak_lr"] = group["lr"]

@@ -113,7 +113,7 @@ def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> None:
 def show_shared_memory(cores: int) -> None:
     """With CPU simulation the process of each core writes what it sees there; with images that may be too much."""
     free = shutil.disk_usage("/dev/shm").free
-    num_envs = 16 * cores
+    num_envs = 32 * cores
     steps = num_envs * max(5, 1600 // num_envs)
     side = math.isqrt(max(0, free - 16 * 2**20) // (3 * steps))  # the rest is for all that is no image
     found = f"{free / 2**20:,.0f} MiB free: "

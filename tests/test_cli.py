@@ -119,7 +119,7 @@ def test_commands_for_the_peers_scripts_parse(trained):
 def test_defaults_by_backend(monkeypatch):
     args = ppo.parse_args(["--no-cuda"])
     cores = ppo.num_cores()
-    assert (args.sim_backend, args.num_envs, args.num_eval_envs) == ("physx_cpu", 16 * cores, 16 * cores)
+    assert (args.sim_backend, args.num_envs, args.num_eval_envs) == ("physx_cpu", 32 * cores, 32 * cores)
     assert args.num_actors == cores and args.num_steps == max(5, 1600 // args.num_envs)
     assert args.batch_size >= args.num_minibatches and args.num_iterations > 10
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])

@@ -169,7 +169,7 @@ def test_learning_rates(run):
         for number, iteration in enumerate(record.iterations):
             factor = 1 - number / ITERATIONS if anneal_lr else 1
             for update in iteration["updates"]:
-                assert update["rates"] == pytest.approx([1e-3 * factor, 5e-3 * factor, 3e-3 * factor])
+                assert update["rates"] == pytest.approx([1e-3 * factor, 3e-3 * factor, 5e-3 * factor])
             assert record.train_rows[number]["learning_rate"] == pytest.approx(1e-3 * factor)
 
 
