@@ -223,7 +223,7 @@ class Args:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
     anneal_lr: bool = False
-    """let the learning rate fall linearly to zero over the run (on a CPU: yes)"""
+    """let the learning rate fall linearly to zero over the run; with desired_kl the critic's alone (on a CPU: yes)"""
     gamma: float = 0.8
     """discount factor"""
     gae_lambda: float = 0.9
@@ -245,7 +245,9 @@ class Args:
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: Optional[float] = 0.1
-    """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never)"""
+    """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never, as on a CPU)"""
+    desired_kl: Optional[float] = None
+    """adapt the policy's learning rate after each minibatch to keep the KL divergence near this (on a CPU: 0.05)"""
     reward_scale: float = 1.0
     """factor on the rewards that are learned from; logged returns are without it"""
     bootstrap_at_done: Literal["always", "truncated", "never"] = "always"
@@ -331,7 +333,7 @@ class Args:
 
 CPU_DEFAULTS = dict(
     total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, eval_freq=10,
+    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, eval_freq=10,
 )  # fmt: skip
 
 # --evaluate takes the flags of the machine from the command line, not the run; training from a --checkpoint takes those
@@ -1318,6 +1320,15 @@ UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac
 KL = UPDATE_METRICS.index("approx_kl")
 
 
+def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
+    """Lower the policy's learning rate where the KL divergence is more than twice the desired one, raise it where it is
+    less than half of it (Rudin et al. 2022, arXiv 2109.11978), within a hundredth and ten times of the first one."""
+    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
+    for group in optimizer.param_groups:
+        if group["adapts"]:
+            group["lr"].mul_(factor).clamp_(group["first_lr"] / 100, group["first_lr"] * 10)
+
+
 def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values) -> torch.Tensor:
     """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows, in
     each of the processes that train together: the step is that of all their rows.
@@ -1351,7 +1362,9 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     optimizer.step()
 
     with torch.no_grad():
-        approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        approx_kl = average(((ratio - 1) - logratio).mean())  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        if args.desired_kl is not None:
+            adapt_learning_rate(optimizer, approx_kl, args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -1588,7 +1601,7 @@ def plot_learning_curve(run_dir: Path) -> None:
 LIMITS = (  # of numbers that are given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
               "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
-    (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale checkpoint_minutes"),
     (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq eval_seed "
               "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
@@ -1895,8 +1908,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
         {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
     ]
-    for group in groups:
-        group["peak_lr"] = group["lr"]
+    for group, of_policy in zip(groups, (True, True, False)):
+        group |= {"first_lr": group["lr"], "adapts": of_policy and args.desired_kl is not None}
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
 
     def load_optimizer(state: dict) -> None:
@@ -2123,7 +2136,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         torch.set_num_threads(num_cores())
         if args.anneal_lr:
             for group in optimizer.param_groups:
-                group["lr"].fill_(group["peak_lr"] * (1 - iteration / args.num_iterations))
+                if not group["adapts"]:
+                    group["lr"].fill_(group["first_lr"] * (1 - iteration / args.num_iterations))
         update_metrics = []
         for _ in range(0 if problem else args.update_epochs):
             torch.randperm(share.batch_size, out=permutation)

@@ -220,7 +220,7 @@ class Args:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1,600 / num_envs, at least 5)"""
     anneal_lr: bool = False
-    """let the learning rate fall linearly to zero over the run (on a CPU: yes)"""
+    """let the learning rate fall linearly to zero over the run; with desired_kl the critic's alone (on a CPU: yes)"""
     gamma: float = 0.8
     """discount factor"""
     gae_lambda: float = 0.9
@@ -243,6 +243,8 @@ class Args:
     """largest norm of the gradient"""
     target_kl: Optional[float] = 0.1
     """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never)"""
+    desired_kl: Optional[float] = None
+    """adapt the policy's learning rate after each minibatch to keep the KL divergence near this (None: do not)"""
     reward_scale: float = 1.0
     """factor on the rewards that are learned from; logged returns are without it"""
     bootstrap_at_done: Literal["always", "truncated", "never"] = "always"
@@ -1482,6 +1484,15 @@ UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac
 KL = UPDATE_METRICS.index("approx_kl")
 
 
+def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
+    """Lower the policy's learning rate where the KL divergence is more than twice the desired one, raise it where it is
+    less than half of it (Rudin et al. 2022, arXiv 2109.11978), within a hundredth and ten times of the first one."""
+    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
+    for group in optimizer.param_groups:
+        if group["adapts"]:
+            group["lr"].mul_(factor).clamp_(group["first_lr"] / 100, group["first_lr"] * 10)
+
+
 def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values) -> torch.Tensor:
     """One gradient step of PPO (Schulman et al. 2017, arXiv 1707.06347, eq. 7 and 9) on tensors of `minibatch` rows, in
     each of the processes that train together: the step is that of all their rows.
@@ -1515,7 +1526,9 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     optimizer.step()
 
     with torch.no_grad():
-        approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        approx_kl = average(((ratio - 1) - logratio).mean())  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        if args.desired_kl is not None:
+            adapt_learning_rate(optimizer, approx_kl, args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -1755,7 +1768,7 @@ LIMITS = (  # of numbers that are given; none may be infinite or not a number
     (1, 32, "frame_stack"),
     (8, 4096, "camera_width camera_height"),
     (0, 32, "random_shift"),
-    (1e-12, 1e12, "learning_rate clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale checkpoint_minutes"),
     (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq eval_seed "
               "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
@@ -2127,8 +2140,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
         {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
     ]
-    for group in groups:
-        group["peak_lr"] = group["lr"]
+    for group, of_policy in zip(groups, (True, True, False)):
+        group |= {"first_lr": group["lr"], "adapts": of_policy and args.desired_kl is not None}
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
 
     def load_optimizer(state: dict) -> None:
@@ -2359,7 +2372,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         torch.set_num_threads(num_cores())
         if args.anneal_lr:
             for group in optimizer.param_groups:
-                group["lr"].fill_(group["peak_lr"] * (1 - iteration / args.num_iterations))
+                if not group["adapts"]:
+                    group["lr"].fill_(group["first_lr"] * (1 - iteration / args.num_iterations))
         update_metrics = []
         for _ in range(0 if problem else args.update_epochs):
             torch.randperm(share.batch_size, out=permutation)

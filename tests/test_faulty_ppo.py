@@ -173,6 +173,20 @@ def test_learning_rates(run):
             assert record.train_rows[number]["learning_rate"] == pytest.approx(1e-3 * factor)
 
 
+@pytest.mark.parametrize("desired_kl, reached", [(0.003, {2 / 3, 1, 1.5}), (1e-9, {2 / 3, 1.5}), (1e6, {1.5})])
+def test_learning_rate_follows_the_divergence(run, desired_kl, reached):
+    """The KL divergence of each minibatch sets the policy's rate for the next one, within bounds; not the critic's."""
+    record = run(desired_kl=desired_kl, logstd_lr_factor=3.0, exp_name=f"desired_{desired_kl}")
+    rate, factors = 1e-3, set()
+    for update in [update for iteration in record.iterations for update in iteration["updates"]]:
+        assert update["rates"] == pytest.approx([rate, 3 * rate, 1e-3], rel=1e-4)
+        kl = update["metrics"][ppo.KL]
+        factor = 2 / 3 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1
+        rate = min(max(rate * factor, 1e-5), 1e-2)
+        factors.add(factor)
+    assert factors == reached
+
+
 def test_normalization_follows_the_update(run):
     """Statistics are those that the rollout acted with until its update is over, then those of all data so far."""
     record = run(norm_obs=True)

@@ -6,7 +6,7 @@ physics alone and against another version of the scripts.
 
 The candidates take turns, several repetitions of each, since a shared machine drifts: compare ratios.
 
-  single, batch    one process, random actions, one environment and 16
+  single, batch    one process, random actions, one environment, 16 and 32
   rollout phase    of ppo.py with the trained policy, on all cores, as ppo.py itself logs it
   base             the same of the ppo.py in the folder --base
   physics alone    on all cores at once: what those rollouts told the physics systems is told them again, from the same
@@ -148,6 +148,7 @@ def main():
     candidates = {
         "single": lambda: random_actions(env_id, 1, 300),
         "batch": lambda: random_actions(env_id, 16, 60),
+        "batch of 32": lambda: random_actions(env_id, 32, 30),
         "rollout phase": lambda: rollout_phase(script, options.checkpoint, options.iterations),
         "physics alone": lambda: physics_on_all_cores(options.checkpoint),
     }
@@ -165,7 +166,12 @@ def main():
     for name, values in rates.items():
         print(f"  {name:<32}{statistics.median(values):8,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
     print("ratios, repetition by repetition")
-    for a, b in (("batch", "single"), ("rollout phase", "base"), ("rollout phase", "physics alone")):
+    for a, b in (
+        ("batch", "single"),
+        ("batch of 32", "single"),
+        ("rollout phase", "base"),
+        ("rollout phase", "physics alone"),
+    ):
         if b in rates:
             ratios = [x / y for x, y in zip(rates[a], rates[b])]
             print(f"  {a + ' / ' + b:<32}{statistics.median(ratios):8.2f}   ({min(ratios):.2f} to {max(ratios):.2f})")

@@ -6,7 +6,7 @@ One run alternates between the candidates, several repetitions of each, and prin
 machine drifts: compare ratios, not absolute figures. Both learners have the same networks (3 x 256, tanh, one for
 policy and one for value), minibatch size, epochs and batch, and no target KL that would end an update early:
 
-  ppo.py            32 environments, in batches of one process for each core
+  ppo.py            its defaults: one process for each core, a batch of 32 environments in each
   SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
   ppo.py, loaded    ppo.py while two other processes do nothing but count
 """
@@ -28,13 +28,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo
 
-BATCH, MINIBATCHES, EPOCHS = 1600, 8, 8
+BATCH, MINIBATCHES, EPOCHS = 1600, 4, 8
 SCRIPT = Path(ppo.__file__)
 
 
 def ours(iterations):
     """ppo.py as a command. Returns for each iteration its steps a second."""
-    flags = (f"--no-cuda --num_envs 32 --num_steps {BATCH // 32} --num_minibatches {MINIBATCHES} --target_kl None "
+    flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None "
              f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations} --eval_freq 0 --num_eval_episodes 2 "
              "--num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
