@@ -325,7 +325,7 @@ def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, m
 @pytest.mark.slow
 def test_learns_a_task_of_maniskill(tmp_path):
     """With the defaults, as a user would; a task that is cheap to simulate."""
-    flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 16_000,
+    flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 32_000,
              "--eval_freq", 0, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--exp-name", "x",
              "--no-cuda")  # fmt: skip
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)

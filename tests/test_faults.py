@@ -371,7 +371,7 @@ def test_resume_refuses_other_flags_but_those_that_may_change(trained, in_tmp, c
         assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
     args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --save_freq 7 --track".split())
     assert (args.total_timesteps, args.eval_freq, args.save_freq, args.track) == (1000, 3, 7, True)
-    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 8, 1)
+    assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 4, 1)
     assert ppo.find_run_dir(args) == Path("runs/x")
 
 
@@ -601,9 +601,9 @@ def test_kill_at_random_moments(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_iterations, flags", [(800, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
+@pytest.mark.parametrize("num_iterations, flags", [(1000, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
 def test_memory_is_flat(tmp_path, num_iterations, flags):
-    """Over 800 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
+    """Over 1,000 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
     flags = (*flags, "--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
              "--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 2,
              "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-capture_video", "--no-cuda",
@@ -615,4 +615,4 @@ def test_memory_is_flat(tmp_path, num_iterations, flags):
     for key in ("memory_mb", "actors_memory_mb"):
         quarter = num_iterations // 4
         early, late = [sum(row[key] for row in part) / len(part) for part in (rows[quarter:][:20], rows[-20:])]
-        assert late - early < 2, (key, early, late)
+        assert late - early < 3, (key, early, late)

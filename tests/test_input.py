@@ -125,7 +125,7 @@ def test_notes(arguments, note, in_tmp, capsys):
 VALID = {
     "num_envs": [1, 2, 7], "num_eval_envs": [1, 3], "num_actors": [1], "num_eval_episodes": [1, 4], "num_steps": [4, 9],
     "num_minibatches": [1, 3, 4], "update_epochs": [1, 2], "learning_rate": [1e-9, 0.1, 3], "seed": [0, 2**40],
-    "critic_learning_rate": [0, 1e-3, None], "logstd_lr_factor": [0, 1, 20],
+    "critic_learning_rate": [0, 1e-3, None], "logstd_lr_factor": [0, 2], "desired_kl": [1e-3, 1],
     "gamma": [0, 0.97, 1], "gae_lambda": [0, 0.5, 1], "clip_coef": [0.01, 5],
     "ent_coef": [0, 0.1], "vf_coef": [0, 2], "max_grad_norm": [1e-3, 100], "target_kl": [None, 0, 0.02],
     "reward_scale": [1e-3, 10], "bootstrap_at_done": ["always", "truncated", "never"], "logstd_init": [-3, 0.5],
@@ -171,7 +171,8 @@ def test_fuzz(in_tmp, capsys, monkeypatch):
     counts = [0, 0]
     for k in range(200):
         base = dict(num_envs=7, num_eval_envs=2, num_actors=1, num_eval_episodes=2, num_steps=9, total_timesteps=126,
-                    num_minibatches=4, update_epochs=1, exp_name=f"run{k}")  # fmt: skip
+                    num_minibatches=4, update_epochs=1, desired_kl=None, logstd_lr_factor=1,
+                    exp_name=f"run{k}")  # fmt: skip
         chosen = base | {flag: rng.choice(VALID[flag]) for flag in rng.sample([*VALID], rng.randrange(12))}
         if chosen["num_envs"] * chosen["num_steps"] < chosen["num_minibatches"]:
             chosen["num_minibatches"] = 1

@@ -13,7 +13,8 @@ import ppo_rgb
 DIFFERENT = {"Args", "make_env", "Agent", "check_observations", "prepare_rendering", "rollout", "train"}
 DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "OF_THE_NETWORK", "MAY_CHANGE", "LIMITS"}
 DIFFERENT_HELP = {
-    "obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs", "eval_freq", "num_eval_episodes"
+    "obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs", "eval_freq", "num_eval_episodes",
+    "total_timesteps", "num_minibatches", "logstd_lr_factor", "target_kl", "desired_kl",
 }  # fmt: skip
 MOST_DIFFERENT_LINES = {"rollout": 12, "train": 13}
 
