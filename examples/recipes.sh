@@ -10,13 +10,13 @@ cd "$(dirname "$0")/.."
 
 # --- states, CPU ---
 
-# Measured, seeds 1 to 5: success_once 1.00 each after 250,000 steps (263 to 287 s), 0.95 after 98 to 177 s.
+# Measured, seeds 1 to 5: success_once 0.97 to 1.00 after 120,000 steps (130 to 149 s), 0.95 after 66 to 82 s.
 push_cube_cpu() { python ppo.py --env_id PushCube-v1 --no-cuda "$@"; }
 
-# Measured, seed 1: success_once 0.94 after 1,040,000 steps (16 min); stopped by hand at 1,120,000.
+# Measured, seed 1, with the flags of an earlier version: success_once 0.94 after 1,040,000 steps (16 min). With these,
+# 0.70 after 320,000 (9 min), then stopped.
 pick_cube_cpu() {
-    python ppo.py --env_id PickCube-v1 --no-cuda --total_timesteps 2000000 --num_envs 32 --num_steps 50 \
-        --learning_rate 6e-4 --eval_freq 50 "$@"
+    python ppo.py --env_id PickCube-v1 --no-cuda --total_timesteps 800000 --eval_freq 20 "$@"
 }
 
 # Measured, seed 1: return 1,000 of 1,000 after 96,000 steps, 919 after 32,000.
