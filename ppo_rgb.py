@@ -735,11 +735,6 @@ class BatchedPhysx:
     def gpu_init(self) -> None:
         self.free = [body for system in self.systems for body in system.rigid_dynamic_components]
         self.links = [link for system in self.systems for link in system.articulation_link_components]
-        numbered = list(enumerate(self.systems))
-        self.scene_of_free = [i for i, system in numbered for _ in system.rigid_dynamic_components]
-        self.scene_of_articulation = [
-            i for i, system in numbered for link in system.articulation_link_components if link.is_root
-        ]
         self.articulations = [link.articulation for link in self.links if link.is_root]
         self.joints = [articulation.active_joints for articulation in self.articulations]
         self.row = {body: i for i, body in enumerate(self.free + self.links)}
@@ -759,12 +754,15 @@ class BatchedPhysx:
         # quaternion (w first), position, linear and angular velocity; for articulations also positions, velocities and
         # both kinds of drive targets of their joints.
         free_at, roots_at, joints_at, end = [], [], [], 0
-        for system in self.systems:
+        self.scene_of_free, self.scene_of_articulation = [], []
+        for i, system in enumerate(self.systems):
             for _ in system.rigid_dynamic_components:
+                self.scene_of_free.append(i)
                 free_at.append(end)
                 end += 13
             for link in system.articulation_link_components:
                 if link.is_root:
+                    self.scene_of_articulation.append(i)
                     roots_at.append(end)
                     joints_at.append(end + 13)
                     end += 13 + 4 * link.articulation.dof
@@ -776,8 +774,8 @@ class BatchedPhysx:
             positions = joints_at[i] + torch.arange(articulation.dof)
             self.joint_columns[0, i, : articulation.dof] = positions
             self.joint_columns[1, i, : articulation.dof] = positions + articulation.dof
-        self.states, self.poses, self.pose_sizes = [b""] * len(numbered), [b""] * len(numbered), None
-        self.moved, self.contacts = set(range(len(numbered))), None
+        self.states, self.poses, self.pose_sizes = [b""] * len(self.systems), [b""] * len(self.systems), None
+        self.moved, self.contacts = set(range(len(self.systems))), None
         self.gpu_fetch_rigid_dynamic_data()
         self.gpu_fetch_articulation_link_pose()
         self.gpu_fetch_articulation_qpos()
@@ -1526,9 +1524,9 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     optimizer.step()
 
     with torch.no_grad():
-        approx_kl = average(((ratio - 1) - logratio).mean())  # estimator k3 of http://joschu.net/blog/kl-approx.html
+        approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
         if args.desired_kl is not None:
-            adapt_learning_rate(optimizer, approx_kl, args.desired_kl)
+            adapt_learning_rate(optimizer, average(approx_kl), args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -2134,14 +2132,16 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     agent = Agent(obs_space, action_space, args).to(device)
     lr = args.learning_rate
     critic_lr = lr if args.critic_learning_rate is None else args.critic_learning_rate
-    named = [*agent.named_parameters()]
+    named, adapts = [*agent.named_parameters()], args.desired_kl is not None
+    actor = [p for name, p in named if not name.startswith(("critic", "actor_logstd"))]  # with features they share
+    critic = [p for name, p in named if name.startswith("critic")]
     groups = [
-        {"params": [p for name, p in named if not name.startswith(("critic", "actor_logstd"))], "lr": lr},
-        {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor},
-        {"params": [p for name, p in named if name.startswith("critic")], "lr": critic_lr},
+        {"params": actor, "lr": lr, "adapts": adapts},
+        {"params": [agent.actor_logstd], "lr": lr * args.logstd_lr_factor, "adapts": adapts},
+        {"params": critic, "lr": critic_lr, "adapts": False},
     ]
-    for group, of_policy in zip(groups, (True, True, False)):
-        group |= {"first_lr": group["lr"], "adapts": of_policy and args.desired_kl is not None}
+    for group in groups:
+        group["first_lr"] = group["lr"]
     optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
 
     def load_optimizer(state: dict) -> None:

@@ -4,7 +4,8 @@
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
 # 'Measured' is on 2 cores of a shared x86-64 machine without a GPU, training time at 500 to 1,100 steps/s; the rest of
-# the numbers are in README.md. 'Not measured here' means just that: the flags are a start, not a result.
+# the numbers are in README.md. All but PushCube's are of an earlier version, with its defaults. 'Not measured here'
+# means just that: the flags are a start, not a result.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
