@@ -55,10 +55,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
 
-# Idle OpenMP threads spin, on cores that the simulation or other work needs: let them sleep soon
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "300")
-
 # Vulkan's absence is said in plain words later; the others come from the depths of ManiSkill and mean nothing here
 warnings.filterwarnings(
     "ignore",
@@ -135,6 +131,8 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+gc.freeze()  # ManiSkill collects garbage each time it builds scenes: skip the objects that the imports made
 
 parse_backends = sapien_env.parse_sim_and_render_backend
 
@@ -1100,7 +1098,6 @@ def run_actor(conn, *arguments) -> None:
     torch.set_num_threads(1)
     try:
         actor = Actor(*arguments)
-        conn.send("built")
         while True:
             try:
                 method, *rest = conn.recv()
@@ -1136,8 +1133,6 @@ class Actors:
             signal.signal(s, handler)
         try:
             self.local = Actor(args, 0, trajectory_dir)
-            for i in range(len(self.conns)):
-                self._receive(i)
         except BaseException:
             self.close()
             raise
@@ -2111,7 +2106,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             bar.write(f"step {global_step:>9,}  evaluation: {', '.join(summary(metrics))}" + "  (best)" * best)
             if best and save("best.pt", snapshot | {"best_score": score}):
                 best_score = score
-            attempt("learning_curve.png", plot_learning_curve, run_dir)
+            if iteration > 0:
+                attempt("learning_curve.png", plot_learning_curve, run_dir)
             if args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success:
                 finished = True
         if finished or stopped_by:
@@ -2133,7 +2129,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
-        torch.set_num_threads(num_cores())
+        # half the cores: OpenMP's threads wait for the slowest, and stall where other work takes one of their cores
+        torch.set_num_threads(max(1, num_cores() // 2))
         if args.anneal_lr:
             for group in optimizer.param_groups:
                 if not group["adapts"]:
