@@ -187,7 +187,7 @@ class Args:
     """where images are rendered: gpu (gpu:1) or cpu; what is not there is replaced by what is"""
     num_envs: int = 256
     """parallel training environments (on a CPU: 32 a core)"""
-    num_eval_envs: int = 16
+    num_eval_envs: int = 64
     """parallel evaluation environments (on a CPU: 32 a core)"""
     num_actors: Optional[int] = None
     """processes that simulate on a CPU, each its part of the environments (None: one a core)"""
@@ -239,8 +239,8 @@ class Args:
     """weight of the value loss"""
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
-    target_kl: Optional[float] = 0.1
-    """end an iteration's update after an epoch whose mean KL divergence exceeds this (None: never)"""
+    target_kl: Optional[float] = 0.2
+    """end the update after an epoch whose last minibatch has a larger KL divergence (None: never)"""
     desired_kl: Optional[float] = None
     """adapt the policy's learning rate after each minibatch to keep the KL divergence near this (None: do not)"""
     reward_scale: float = 1.0
@@ -260,7 +260,7 @@ class Args:
     norm_obs: bool = False
     """normalise the state by its running mean and variance (on a CPU: yes)"""
     logstd_init: float = -0.5
-    """initial logarithm of the policy's standard deviation"""
+    """initial logarithm of the policy's standard deviation (ManiSkill: ppo.py -0.5, ppo_fast.py 0)"""
 
     # --- evaluation and checkpoints ---
     eval_freq: int = 25
@@ -334,7 +334,7 @@ class Args:
 
 CPU_DEFAULTS = dict(
     total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    eval_freq=50, num_eval_episodes=16,
+    target_kl=0.1, eval_freq=50, num_eval_episodes=16,
 )  # fmt: skip
 TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
 
@@ -453,9 +453,12 @@ def find_run_dir(args: Args) -> Path:
 
 
 def resolve_backend(args: Args) -> str:
-    if args.sim_backend == "auto":
-        return "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
-    return {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}.get(args.sim_backend, args.sim_backend)
+    names = {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}
+    names["auto"] = "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
+    backend = names.get(args.sim_backend, args.sim_backend)
+    if backend == "physx_cuda" and WORLD_SIZE == 1:
+        return "physx_cuda:0"  # without an index SAPIEN takes the first device in Vulkan's order, torch in CUDA's
+    return backend
 
 
 # ----- Environments ---------------------------------------------------------------------------------------------------
@@ -1800,13 +1803,15 @@ def check(args: Args) -> None:
         fail(f"torchrun started {LOCAL_WORLD_SIZE} processes, and there are {torch.cuda.device_count()} GPUs: one each")
     if WORLD_SIZE > 1 and args.sim_backend.startswith("physx_cuda:"):
         fail(f"--sim_backend {args.sim_backend}: with torchrun each process takes a GPU of its own: physx_cuda")
+    if on_gpu and (args.shader or "").startswith("rt"):
+        fail(f"--shader {args.shader}: ray tracing needs CPU simulation: --sim_backend physx_cpu")
     if on_gpu and not args.cuda:
         fail(f"--sim_backend {args.sim_backend} contradicts --no-cuda")
     if on_gpu or args.cuda and Path("/proc/driver/nvidia").exists():
         try:
             torch.zeros(1, device=choose_device(args.share()) if on_gpu else f"cuda:{LOCAL_RANK}")
             if on_gpu:
-                sapien.physx.enable_gpu()  # which downloads PhysX's GPU library the first time
+                enable_gpu_physics()
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]
             if on_gpu or WORLD_SIZE > 1:
@@ -1928,6 +1933,15 @@ def find_cameras(args: Args, spec, robots: list) -> Optional[list[tuple[int, int
         return None
 
 
+def enable_gpu_physics() -> None:
+    """SAPIEN downloads PhysX's GPU library when it is first needed: one process at a time, torchrun starts several."""
+    with contextlib.ExitStack() as closing:
+        if fcntl is not None:
+            lock = closing.enter_context(open(Path(tempfile.gettempdir()) / f"physx-{os.getuid()}.lock", "w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        sapien.physx.enable_gpu()
+
+
 def check_observations(args: Args, spec, robots: list) -> None:
     """Refuse images that nothing can render, and more of them than the memory can hold."""
     textures = args.obs_mode.split("+")
@@ -1942,8 +1956,6 @@ def check_observations(args: Args, spec, robots: list) -> None:
     if args.shader == "minimal" and beyond_minimal:
         fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
     on_gpu = args.sim_backend != "physx_cpu"
-    if on_gpu and args.shader.startswith("rt"):
-        fail(f"--shader {args.shader}: ray tracing needs CPU simulation: --sim_backend physx_cpu")
     if args.render_backend == "none":
         fail("--render_backend none: images must be rendered; to learn from the state: ppo.py")
     if RENDER_DEVICE is None or on_gpu and not RENDER_DEVICE.is_cuda():
@@ -2014,6 +2026,8 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     run_dir = find_run_dir(args)
     prepare_rendering(args)
     torch.set_num_threads(1)
+    if args.sim_backend != "physx_cpu":
+        torch.cuda.set_device(choose_device(args))
     actors = Actors(args, run_dir / "test_videos")
     closing.callback(actors.close)
     envs = actors.local.eval_envs
@@ -2269,7 +2283,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         returns.copy_(gae[1])
 
     def update_epoch():
-        """Every minibatch of a permutation of the batch; returns the mean of their UPDATE_METRICS."""
+        """Every minibatch of a permutation of the batch; returns the UPDATE_METRICS of each, a row a minibatch."""
         mb_metrics = []
         for mb_inds in permutation.split(share.minibatch_size)[: args.num_minibatches]:
             mb_obs = {k: v[mb_inds] for k, v in b_obs.items()}
@@ -2277,7 +2291,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
                 mb_obs = random_shift(mb_obs, args.random_shift)
             minibatch = [x[mb_inds] for x in batch]
             mb_metrics.append(update_minibatch(agent, optimizer, args, mb_obs, *minibatch))
-        return average(torch.stack(mb_metrics).mean(0))
+        return average(torch.stack(mb_metrics))
 
     launch_update_epoch = cuda_graph(update_epoch)
 
@@ -2375,7 +2389,8 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         for _ in range(0 if problem else args.update_epochs):
             torch.randperm(share.batch_size, out=permutation)
             update_metrics.append(launch_update_epoch().clone())
-            if args.target_kl is not None and update_metrics[-1][KL] > args.target_kl:  # the host waits, once an epoch
+            last_kl = update_metrics[-1][-1, KL]
+            if args.target_kl is not None and last_kl > args.target_kl:  # the host waits, once an epoch
                 break
         if args.norm_obs and not problem:  # after the update, for which the rollout's log-probabilities must stay valid
             if "state" in b_obs:
@@ -2387,7 +2402,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         # --- log: here the host waits for the device ---
         metrics = {}
         if update_metrics:
-            metrics = dict(zip(UPDATE_METRICS, torch.stack(update_metrics).mean(0).tolist()))
+            metrics = dict(zip(UPDATE_METRICS, torch.cat(update_metrics).mean(0).tolist()))
             healthy = torch.stack([x.isfinite().all() for x in agent.state_dict().values()]).all()
             if not (healthy and all(map(math.isfinite, metrics.values()))):
                 problem = "non-finite loss, gradient or normalisation"

@@ -208,19 +208,19 @@ def test_normalization_follows_the_update(run):
 
 
 def test_the_first_epoch_beyond_target_kl_is_the_last(run):
-    """By the mean over an epoch's minibatches; the threshold lies between what the epochs of a longer run had."""
+    """By its last minibatch, as in CleanRL; the threshold is what the first epochs of a longer run had at most."""
 
     def divergences(record):
         kl = [
             [update["metrics"][ppo.UPDATE_METRICS.index("approx_kl")].item() for update in i["updates"]]
             for i in record.iterations
         ]
-        return [np.mean(np.reshape(x, (-1, 4)), axis=1).tolist() for x in kl]
+        return [np.reshape(x, (-1, 4))[:, -1].tolist() for x in kl]
 
-    flags = dict(update_epochs=6, learning_rate=3e-3)
+    flags = dict(update_epochs=6, learning_rate=5e-4)
     free = divergences(run(**flags, exp_name="free"))
-    assert all(len(x) == 6 for x in free) and free[0][1] > free[0][0]
-    target = (sorted(free[0])[2] + sorted(free[0])[3]) / 2
+    assert all(len(x) == 6 for x in free)
+    target = max(free[0][:2])
     stopped = divergences(run(**flags, target_kl=target, exp_name="stopped"))
     first = next(i for i, x in enumerate(free[0]) if x > target)
     assert 0 < first < 5 and stopped[0] == pytest.approx(free[0][: first + 1])

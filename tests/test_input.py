@@ -2,6 +2,8 @@
 
 import random
 import sys
+import threading
+import time
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import torch
 from conftest import refused
 
 import ppo
+import ppo_rgb
 
 
 @pytest.mark.parametrize(
@@ -92,6 +95,31 @@ def test_physx_without_its_library_is_refused(in_tmp, capsys, monkeypatch):
 
         monkeypatch.setattr(ppo.sapien.physx, "enable_gpu", enable_gpu)
         assert remedy in refused(["--sim_backend", "physx_cuda", "--no-capture_video"], capsys)
+
+
+@pytest.mark.parametrize("script", [ppo, ppo_rgb])
+def test_one_process_at_a_time_downloads_physx(script, monkeypatch):
+    inside, most = [], []
+
+    def enable_gpu():
+        inside.append(1)
+        time.sleep(0.05)
+        most.append(len(inside))
+        inside.pop()
+
+    monkeypatch.setattr(script.sapien.physx, "enable_gpu", enable_gpu)
+    threads = [threading.Thread(target=script.enable_gpu_physics) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1] * 4
+
+
+@pytest.mark.parametrize("script", [ppo, ppo_rgb])
+def test_ray_tracing_of_a_batch_is_refused(script, in_tmp, capsys):
+    line = refused(["--sim_backend", "physx_cuda", "--shader", "rt-fast"], capsys, script)
+    assert "ray tracing needs CPU simulation" in line
 
 
 def test_driver_too_old_is_told(in_tmp, capsys, monkeypatch):

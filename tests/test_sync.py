@@ -83,5 +83,5 @@ def test_flags_that_both_have_are_the_same():
     assert b.keys() - a.keys() == set(of_images.split())
     shared = a.keys() & b.keys()
     assert {k for k in shared if a[k][0] != b[k][0]} == {"obs_mode", "shader"}
-    assert {k for k in shared if a[k][1] != b[k][1]} == {"obs_mode", "num_envs", "render_mode", "shader"}
+    assert {k for k in shared if a[k][1] != b[k][1]} == {"obs_mode", "num_envs", "target_kl", "render_mode", "shader"}
     assert {k for k in shared if a[k][2] != b[k][2]} == DIFFERENT_HELP
