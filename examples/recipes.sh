@@ -53,29 +53,34 @@ push_cube_images_cpu() {
         --eval_freq 10 --num_eval_episodes 16 "$@"
 }
 
-# --- states, GPU: not measured here ---
+# --- states, GPU: not measured here; the flags that ManiSkill publishes for its own scripts, unchanged ---
 
-push_cube_gpu() { python ppo.py --env_id PushCube-v1 --num_envs 2048 --total_timesteps 5000000 "$@"; }
+push_cube_gpu() {
+    python ppo.py --env_id PushCube-v1 --num_envs 2048 --update_epochs 8 --num_minibatches 32 \
+        --total_timesteps 2000000 --eval_freq 10 --num_steps 20 "$@"
+}
 pick_cube_gpu() {
-    python ppo.py --env_id PickCube-v1 --num_envs 1024 --update_epochs 8 --total_timesteps 10000000 "$@"
-}
-stack_cube_gpu() {
-    python ppo.py --env_id StackCube-v1 --num_envs 1024 --update_epochs 8 --total_timesteps 25000000 "$@"
-}
-cartpole_swing_up_gpu() {
-    python ppo.py --env_id MS-CartpoleSwingUp-v1 --num_envs 512 --gamma 0.99 --gae_lambda 0.95 \
+    python ppo.py --env_id PickCube-v1 --num_envs 1024 --update_epochs 8 --num_minibatches 32 \
         --total_timesteps 10000000 "$@"
 }
+stack_cube_gpu() {
+    python ppo.py --env_id StackCube-v1 --num_envs 1024 --update_epochs 8 --num_minibatches 32 \
+        --total_timesteps 25000000 "$@"
+}
+cartpole_swing_up_gpu() {
+    python ppo.py --env_id MS-CartpoleSwingUp-v1 --num_envs 1024 --update_epochs 8 --num_minibatches 32 \
+        --total_timesteps 10000000 --num_steps 250 --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 --eval_freq 5 "$@"
+}
 
-# --- images, GPU: not measured here ---
+# --- images, GPU: not measured here; ManiSkill's flags too ---
 
 push_cube_images_gpu() {
     python ppo_rgb.py --env_id PushCube-v1 --num_envs 256 --update_epochs 8 --num_minibatches 8 \
-        --total_timesteps 1000000 --amp "$@"
+        --total_timesteps 1000000 --eval_freq 10 --num_steps 20 "$@"
 }
 pick_cube_images_gpu() {
     python ppo_rgb.py --env_id PickCube-v1 --num_envs 256 --update_epochs 8 --num_minibatches 8 \
-        --total_timesteps 10000000 --amp "$@"
+        --total_timesteps 10000000 "$@"
 }
 
 recipes=$(declare -F | awk '{print $3}')
