@@ -9,6 +9,7 @@
 #     "tyro>=0.9,<2",
 #     "matplotlib>=3.8,<4",
 #     "psutil>=5.9,<8",
+#     "imageio[ffmpeg]>=2.34,<3",
 # ]
 # ///
 """PPO for ManiSkill from images, in one file.
@@ -69,6 +70,7 @@ except ImportError:  # on Windows
     fcntl = None
 
 import gymnasium as gym
+import imageio
 import numpy as np
 import psutil
 import sapien
@@ -117,6 +119,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Articulation, Link
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
+from mani_skill.utils.visualization.misc import tile_images
 from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -575,17 +578,20 @@ def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = F
     return env
 
 
-def make_envs(args: Args, num_envs: int, seed: int, evaluation: bool = False, record=None) -> ManiSkillVectorEnv:
+def make_envs(
+    args: Args, num_envs: int, seed: int, evaluation: bool = False, film: bool = False, record: Optional[dict] = None
+) -> ManiSkillVectorEnv:
     """Environments with ManiSkill's interface for a batch. Those for evaluation do not reset by themselves: `evaluate`
     starts each episode from its seed.
 
     Args:
         seed: what the objects of a batch are built from, in tasks that vary them.
-        record: arguments of RecordEpisode, to film the environments or to write their trajectories."""
+        film: render the environments.
+        record: arguments of RecordEpisode, to write trajectories."""
     sapien_env.BaseEnv.build_seed = seed
-    env = make_env(args, num_envs, evaluation, film=bool(record and record["save_video"]))
+    env = make_env(args, num_envs, evaluation, film)
     if record:
-        env = RecordEpisode(env, save_on_reset=True, source_type="rl", source_desc="PPO", **record)
+        env = RecordEpisode(env, save_video=False, save_on_reset=True, source_type="rl", source_desc="PPO", **record)
     return ManiSkillVectorEnv(
         env,
         auto_reset=not evaluation,
@@ -651,17 +657,23 @@ class Film:
         self.num_envs = 1 if args.sim_backend == "physx_cpu" else 4
 
     def record(self, agent, name: str, num_steps: int, seed: int, exploring: bool = False) -> None:
-        """Write episodes that start from `seed` on as <folder>/<name>.mp4."""
+        """Write episodes that start from `seed` on as <folder>/<name>.mp4; no more than a frame is held."""
         if self.envs is None:
-            video = dict(output_dir=str(self.folder), save_video=True, save_trajectory=False, max_steps_per_video=10**9)
-            self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, record=video)
-            self.envs._env.video_fps = self.envs.base_env.control_freq
-        evaluate(agent, self.envs, self.num_envs, seed, num_steps, rebuilding(self.args), exploring=exploring)
+            self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{name}.mp4"
         try:
-            self.envs._env.flush_video(name=name)
+            with imageio.get_writer(path, fps=self.envs.base_env.control_freq) as writer:
+
+                def write_frame():
+                    pictures = common.to_numpy(self.envs._env.render())
+                    writer.append_data(tile_images(list(pictures), nrows=math.isqrt(self.num_envs)))
+
+                flags = dict(exploring=exploring, write_frame=write_frame)
+                evaluate(agent, self.envs, self.num_envs, seed, num_steps, rebuilding(self.args), **flags)
         except OSError as error:  # such as a full disk
             print(f"a video could not be written, the run goes on: {error}", flush=True)
-            self.envs._env.render_images, self.envs._env._video_steps = [], 0
+            path.unlink(missing_ok=True)
 
     def close(self) -> None:
         if self.envs is not None:
@@ -1107,7 +1119,7 @@ class Actor:
             self.resets_some = can_reset_some(self.envs)
         record = None
         if args.save_trajectory and trajectory_dir:
-            record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}", save_video=False)
+            record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}")
         first = RANK * args.num_eval_episodes + part(args.num_eval_episodes, index, args.num_actors).start
         self.eval_envs = make_envs(args, num_eval_envs or 1, args.eval_seed + first, evaluation=True, record=record)
         base_env = self.eval_envs.base_env
@@ -1596,14 +1608,16 @@ def as_cuda_graph(function, enabled: bool):
 
 @torch.no_grad()
 def evaluate(
-    agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild: int = 0, separately=False, exploring=False
-) -> dict[str, torch.Tensor]:
+    agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild: int = 0, separately: bool = False,
+    exploring: bool = False, write_frame=None,
+) -> dict[str, torch.Tensor]:  # fmt: skip
     """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
 
     Args:
         rebuild: build new scenes, from the seeds too, in every so many rounds of all environments; 0: never.
         separately: as `start_episodes` has it.
         exploring: take random actions, as training does.
+        write_frame: called at the start of an episode and after each step.
 
     Returns return, episode_len, and where the task has them success_once, success_at_end, fail_once, fail_at_end: a
     float tensor (num_episodes,) each, on the CPU."""
@@ -1615,11 +1629,15 @@ def evaluate(
         if rebuild and len(rounds) % rebuild == 0:
             envs.reset(seed=seeds, options=dict(reconfigure=True))
         obs = start_episodes(envs, seeds, separately)
+        if write_frame:
+            write_frame()
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
         episodes = {}
         for step in range(1, num_steps + 1):
             action = agent.sample_action(obs)[0] if exploring else agent.get_action(obs)
             obs, _, terminated, truncated, infos = envs.step(action.clamp(low, high).nan_to_num())
+            if write_frame:
+                write_frame()
             ended = running & (terminated | truncated | (step == num_steps))
             running &= ~ended
             at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Optional
 
-PACKAGES = ("mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil")
+PACKAGES = ("mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil", "imageio")
 ROOT = Path(__file__).resolve().parent.parent  # ppo.py lies here
 
 VULKAN = """

@@ -1,11 +1,13 @@
 """The script as a command: training, evaluating, filming, refusing."""
 
+import contextlib
 import json
 import math
 import os
 import re
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -306,6 +308,26 @@ def test_videos_and_trajectories(in_tmp, capfd):
 
 
 @pytest.mark.render
+def test_a_film_holds_no_more_than_a_frame(tmp_path, monkeypatch):
+    """A thousand of them would take a gigabyte."""
+    frames = []
+
+    class Writer(contextlib.ExitStack):
+        def append_data(self, frame):
+            frames.append(weakref.ref(frame))
+            assert sum(ref() is not None for ref in frames) <= 2 and frame.shape == (512, 512, 3)
+
+    monkeypatch.setattr(ppo.imageio, "get_writer", lambda path, fps: Writer())
+    args = ppo.Args(env_id="MS-CartpoleBalance-v1", sim_backend="physx_cpu")
+    film = ppo.Film(args, tmp_path)
+    envs = ppo.make_envs(args, 1, 0)
+    agent = ppo.Agent(envs.single_observation_space, envs.single_action_space, args)
+    film.record(agent, "long", 12, seed=0)
+    assert len(frames) == 13
+    film.close(), envs.close()
+
+
+@pytest.mark.render
 def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, monkeypatch):
     """And leaves nothing behind in the next one."""
 
@@ -317,7 +339,7 @@ def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, m
     envs = ppo.make_envs(args, 1, 0)
     agent = ppo.Agent(envs.single_observation_space, envs.single_action_space, args)
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules[ppo.RecordEpisode.__module__], "images_to_video", full)
+        patch.setattr(ppo, "tile_images", full)
         film.record(agent, "first", 3, seed=0)
     assert "No space left on device" in capsys.readouterr().out and not list(tmp_path.iterdir())
     film.record(agent, "second", 3, seed=0)
