@@ -4,18 +4,17 @@
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
 # 'Measured' is on 2 cores of a shared x86-64 machine without a GPU, training time at 500 to 1,100 steps/s; the rest of
-# the numbers are in README.md. All but PushCube's are of an earlier version, with its defaults. 'Not measured here'
+# the numbers are in README.md. All but PushCube's and PickCube's are of an earlier version, with its defaults. 'Not measured here'
 # means just that: the flags are a start, not a result.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 # --- states, CPU ---
 
-# Measured, seeds 1 to 5: success_once 0.97 to 1.00 after 120,000 steps (130 to 149 s), 0.95 after 66 to 82 s.
+# Measured, seeds 1 to 5: success_once 0.98 to 1.00 after 120,000 steps (138 to 151 s), 0.95 after 52 to 110 s.
 push_cube_cpu() { python ppo.py --env_id PushCube-v1 --no-cuda "$@"; }
 
-# Measured, seed 1, with the flags of an earlier version: success_once 0.94 after 1,040,000 steps (16 min). With these,
-# 0.70 after 320,000 (9 min), then stopped.
+# Measured, seeds 1 to 3: success_once 0.95, 0.97, 0.97 after 672,000, 544,000, 544,000 steps.
 pick_cube_cpu() {
     python ppo.py --env_id PickCube-v1 --no-cuda --total_timesteps 800000 --eval_freq 20 "$@"
 }
