@@ -4,8 +4,8 @@
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
 # 'Measured' is on 2 cores of a shared x86-64 machine without a GPU, training time at 500 to 1,100 steps/s; the rest of
-# the numbers are in README.md. All but PushCube's and PickCube's are of an earlier version, with its defaults. 'Not measured here'
-# means just that: the flags are a start, not a result.
+# the numbers are in README.md. All but PushCube's and PickCube's are of an earlier version, with its defaults. 'Not
+# measured here' means just that: the flags are a start, not a result.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -68,7 +68,8 @@ stack_cube_gpu() {
 }
 cartpole_swing_up_gpu() {
     python ppo.py --env_id MS-CartpoleSwingUp-v1 --num_envs 1024 --update_epochs 8 --num_minibatches 32 \
-        --total_timesteps 10000000 --num_steps 250 --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 --eval_freq 5 "$@"
+        --total_timesteps 10000000 --num_steps 250 --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 \
+        --eval_freq 5 "$@"
 }
 
 # --- images, GPU: not measured here; ManiSkill's flags too ---
