@@ -372,6 +372,11 @@ def num_cores() -> int:
     return max(1, cores // LOCAL_WORLD_SIZE)
 
 
+def num_update_threads() -> int:
+    """Half the cores: OpenMP's threads wait for the slowest of them, and stall when other work takes its core."""
+    return max(1, num_cores() // 2)
+
+
 @contextlib.contextmanager
 def together():
     """With the other processes that train together; RunError where one of them is gone."""
@@ -456,11 +461,11 @@ def find_run_dir(args: Args) -> Path:
 
 
 def resolve_backend(args: Args) -> str:
-    names = {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}
-    names["auto"] = "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
-    backend = names.get(args.sim_backend, args.sim_backend)
+    backend = {"cpu": "physx_cpu", "gpu": "physx_cuda", "cuda": "physx_cuda"}.get(args.sim_backend, args.sim_backend)
+    if backend == "auto":
+        backend = "physx_cuda" if args.cuda and torch.cuda.is_available() else "physx_cpu"
     if backend == "physx_cuda" and WORLD_SIZE == 1:
-        return "physx_cuda:0"  # without an index SAPIEN takes the first device in Vulkan's order, torch in CUDA's
+        backend = "physx_cuda:0"  # without an index SAPIEN takes the first device in Vulkan's order, torch in CUDA's
     return backend
 
 
@@ -1643,7 +1648,7 @@ def evaluate(
             at_end = {f"{k}_at_end": infos[k] for k in ("success", "fail") if k in infos}
             for k, v in (infos["episode"] | at_end).items():
                 episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
-        if isinstance(envs._env, RecordEpisode) and envs._env.save_trajectory:
+        if isinstance(envs._env, RecordEpisode):
             envs._env.flush_trajectory()
         rounds.append(episodes)
     names = [k for k in (rounds[0] if rounds else {}) if k != "reward"]
@@ -1952,7 +1957,7 @@ def find_cameras(args: Args, spec, robots: list) -> Optional[list[tuple[int, int
 
 
 def enable_gpu_physics() -> None:
-    """SAPIEN downloads PhysX's GPU library when it is first needed: one process at a time, torchrun starts several."""
+    """SAPIEN downloads PhysX's GPU library when it is first needed. The processes of torchrun do this one by one."""
     with contextlib.ExitStack() as closing:
         if fcntl is not None:
             lock = closing.enter_context(open(Path(tempfile.gettempdir()) / f"physx-{os.getuid()}.lock", "w"))
@@ -2397,8 +2402,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         rollout_time = time.perf_counter() - start
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
-        # half the cores: OpenMP's threads wait for the slowest, and stall where other work takes one of their cores
-        torch.set_num_threads(max(1, num_cores() // 2))
+        torch.set_num_threads(num_update_threads())
         if args.anneal_lr:
             for group in optimizer.param_groups:
                 if not group["adapts"]:

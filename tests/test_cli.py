@@ -131,11 +131,10 @@ def test_defaults_by_backend(monkeypatch):
     args = ppo.parse_args([])
     assert args.sim_backend == "physx_cuda:0" and args.exp_name.startswith("PushCube-v1__ppo__1__")
     assert args == replace(ppo.Args(), sim_backend="physx_cuda:0", num_steps=50, num_actors=1, exp_name=args.exp_name)
-    monkeypatch.setattr(ppo, "WORLD_SIZE", 2)
-    monkeypatch.setattr(ppo, "LOCAL_RANK", 1)
-    assert ppo.parse_args([]).share().sim_backend == "physx_cuda:1", "each process of torchrun has its own"
-    monkeypatch.setattr(ppo, "WORLD_SIZE", 1)
-    monkeypatch.setattr(ppo, "LOCAL_RANK", 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "WORLD_SIZE", 2)
+        patch.setattr(ppo, "LOCAL_RANK", 1)
+        assert ppo.parse_args([]).share().sim_backend == "physx_cuda:1", "each process of torchrun has its own"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])

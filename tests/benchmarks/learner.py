@@ -150,7 +150,7 @@ def main():
             steps_alone.append(
                 timed(lambda envs=envs, action=action: [envs.step(action) for _ in range(50)], device) / 50
             )
-        torch.set_num_threads(max(1, ppo.num_cores() // 2))
+        torch.set_num_threads(ppo.num_update_threads())
         alone = statistics.median(steps_alone)
         minibatches = options.update_epochs * options.num_minibatches
         rows = num_envs * num_steps // options.num_minibatches
