@@ -38,6 +38,14 @@ def run_script(*arguments, cwd, env=None, script=ROOT / "ppo.py", timeout=600):
     )
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config):
+    """Two processes, where pytest-xdist is installed: tests/test_task.py must run without it."""
+    is_worker = hasattr(config, "workerinput")
+    if config.pluginmanager.hasplugin("xdist") and not is_worker and config.option.numprocesses is None:
+        config.option.numprocesses, config.option.dist = 2, "worksteal"
+
+
 def pytest_addoption(parser):
     parser.addoption("--env_id", action="append", help="task that tests/test_task.py looks at (may be repeated)")
 
@@ -82,6 +90,9 @@ SMALL = ppo.Args(
     sim_backend="physx_cpu", num_envs=32, num_eval_envs=16, num_eval_episodes=24, num_actors=1, num_steps=10,
     total_timesteps=32 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False,
 )  # fmt: skip
+
+
+ACTIONS = gym.spaces.Box(-1, 1, (2,), np.float32)  # of the torch-native environments
 
 
 def box(size):
@@ -137,13 +148,13 @@ def without_clock(rows):
 
 
 def scalars(folder):
-    """What TensorBoard would show: {tag: [(step, value), ...]}"""
+    """What TensorBoard would show: {tag: {step: value}}"""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     tags = [tag for tag in events.Tags()["scalars"] if tag.split("/")[1] not in WALL_CLOCK]
-    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
+    return {tag: {e.step: e.value for e in events.Scalars(tag)} for tag in tags}
 
 
 def same_run(a, b):
@@ -165,11 +176,11 @@ def in_update(monkeypatch, script):
     def arrange(iteration, action, per_iteration=8):
         update, calls = script.update_minibatch, []
 
-        def counting(*args):
+        def counting(*args, **minibatch):
             calls.append(1)
             if len(calls) == per_iteration * iteration + 3:
                 action()
-            return update(*args)
+            return update(*args, **minibatch)
 
         monkeypatch.setattr(script, "update_minibatch", counting)
 

@@ -36,24 +36,28 @@ class Recording(TorchDispatchMode):
                     old.detach().copy_(new)  # neither in place nor a view
 
 
-def as_recorded_graph(function, enabled):
-    """In place of `as_cuda_graph`: with one call before the recording, which is a call too."""
-    recording, num_calls, result, held = Recording(), 0, None, ()
+class RecordedGraph:
+    """In place of `CudaGraph`: one call before the recording, which is a call too."""
 
-    def launch(*obs):
-        nonlocal num_calls, result, held
-        num_calls += 1
-        if num_calls == 1:
-            held = copy.deepcopy(obs)
-        for old, new in zip(tree_leaves(held), tree_leaves(obs), strict=True):
+    def __init__(self, function, args, device):
+        self.function, self.enabled, self.recording, self.num_calls = function, args.cudagraphs, Recording(), 0
+
+    def __call__(self, *obs):
+        if not self.enabled:
+            return self.function(*obs)
+        self.num_calls += 1
+        if self.num_calls == 1:
+            self.held = copy.deepcopy(obs)
+        for old, new in zip(tree_leaves(self.held), tree_leaves(obs), strict=True):
             old.copy_(new)
-        if num_calls == 1:
-            return function(*held)
-        if num_calls == 2:
-            with recording:
-                result = function(*held)
+        if self.num_calls == 1:
+            return self.function(*self.held)
+        if self.num_calls == 2:
+            with self.recording:
+                self.result = self.function(*self.held)
         else:
-            recording.replay()
-        return result
+            self.recording.replay()
+        return self.result
 
-    return launch
+    def close(self):
+        pass

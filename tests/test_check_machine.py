@@ -57,11 +57,10 @@ def test_shared_memory(monkeypatch, capsys):
         check_machine_script.show_shared_memory(cores)
         output = capsys.readouterr().out
         assert output.startswith(expected) and ("-> --shm-size" in output) == expected.startswith("missing")
-    args = ppo_rgb.Args(num_envs=32, num_steps=50)
     free(64)
-    ppo_rgb.check_shared_memory(ppo_rgb.image_bytes(args, [(102, 102)]) + 16 * 2**20)
+    ppo_rgb.check_shared_memory(32 * 50 * 102 * 102 * 3 + 16 * 2**20)
     with pytest.raises(SystemExit):
-        ppo_rgb.check_shared_memory(ppo_rgb.image_bytes(args, [(103, 103)]) + 16 * 2**20)
+        ppo_rgb.check_shared_memory(32 * 50 * 103 * 103 * 3 + 16 * 2**20)
 
 
 def test_where_all_is_broken(tmp_path):

@@ -88,10 +88,10 @@ def test_wilson_interval():
         (1, 29, 0.0061, 0.1718),
     ):
         values = torch.cat([torch.ones(successes), torch.zeros(n - successes)])
-        assert ppo.interval(values, rate=True) == pytest.approx((low, high), abs=2e-4)
+        assert ppo.interval(values, is_rate=True) == pytest.approx((low, high), abs=2e-4)
     values = torch.arange(10.0)
     half = 1.96 * values.std().item() / 10**0.5
-    assert ppo.interval(values, rate=False) == pytest.approx((4.5 - half, 4.5 + half))
+    assert ppo.interval(values, is_rate=False) == pytest.approx((4.5 - half, 4.5 + half))
 
 
 def test_refusal_as_a_command(tmp_path):
@@ -134,7 +134,8 @@ def test_defaults_by_backend(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(ppo, "WORLD_SIZE", 2)
         patch.setattr(ppo, "LOCAL_RANK", 1)
-        assert ppo.parse_args([]).share().sim_backend == "physx_cuda:1", "each process of torchrun has its own"
+        local = ppo.local_args(ppo.parse_args([]))
+        assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process of torchrun has its own"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
@@ -148,6 +149,8 @@ def test_help_shows_every_flag_with_this_machines_defaults(tmp_path):
     assert process.returncode == 0
     for field in ppo.Args.__dataclass_fields__:
         assert "--" + field.replace("_", "-") in process.stdout or "--" + field in process.stdout
+    for group in ("Experiment", "Environment", "PPO", "Evaluation", "Runtime"):
+        assert f"{group} options" in process.stdout
     assert f"{ppo.parse_args([]).num_envs}" in process.stdout
 
 
@@ -216,7 +219,6 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
         "step",
         "100%",
         "learning curve",
-        "to evaluate",
         "python",
     ]
     assert [kind for kind, line in zip(kinds, staying) if kind in line] == kinds, staying
@@ -302,8 +304,7 @@ def test_videos_and_trajectories(in_tmp, capfd):
     videos = [run / f"test_videos/seed_{seed}.mp4" for seed in range(7, 11)]
     assert sorted((run / "test_videos").iterdir()) == sorted(videos)
     assert all(8 <= len(frames(video)) <= 10 for video in videos)
-    output = capfd.readouterr().out
-    assert all(str(video) in output for video in videos)
+    assert "test_videos" in capfd.readouterr().out
 
 
 @pytest.mark.render
@@ -321,7 +322,7 @@ def test_a_film_holds_no_more_than_a_frame(tmp_path, monkeypatch):
     film = ppo.Film(args, tmp_path)
     envs = ppo.make_envs(args, 1, 0)
     agent = ppo.Agent(envs.single_observation_space, envs.single_action_space, args)
-    film.record(agent, "long", 12, seed=0)
+    film.record(agent, "long", 0, 12)
     assert len(frames) == 13
     film.close(), envs.close()
 
@@ -339,9 +340,9 @@ def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, m
     agent = ppo.Agent(envs.single_observation_space, envs.single_action_space, args)
     with monkeypatch.context() as patch:
         patch.setattr(ppo, "tile_images", full)
-        film.record(agent, "first", 3, seed=0)
+        film.record(agent, "first", 0, 3)
     assert "No space left on device" in capsys.readouterr().out and not list(tmp_path.iterdir())
-    film.record(agent, "second", 3, seed=0)
+    film.record(agent, "second", 0, 3)
     assert [path.name for path in tmp_path.iterdir()] == ["second.mp4"]
     assert 3 <= len(frames(tmp_path / "second.mp4")) <= 5
     film.close()

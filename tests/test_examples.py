@@ -169,6 +169,16 @@ FAULTS = {
         "            self.goal.set_pose(",
         "overlap by [0-9]+ mm",
     ),
+    "torch.rand": (
+        "u = self._batched_episode_rng[env_idx].uniform(size=5)  # (b, 5)",
+        "u = torch.rand(b, 5)",
+        "of one seed depends on the seeds of other environments: draw from self._batched_episode_rng",
+    ),
+    "replaces its own tensor": (
+        "self.first_distance[env_idx] = self.distance()[env_idx]",
+        "self.first_distance = self.distance()[env_idx]",
+        r"self.first_distance has 2 rows .* keeps num_envs rows: allocate it in _load_scene",
+    ),
     "unseeded numpy": (
         "self._batched_episode_rng[env_idx].uniform(size=5)",
         "np.random.default_rng().uniform(size=(b, 5))",
@@ -197,8 +207,8 @@ def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
         registry.pop("Broken-v1", None)
     env = make("spoiled:Broken-v1", num_envs=NUM_ENVS)
     with pytest.raises(AssertionError, match=message):
-        for check in (test_task.check_seeds, test_task.check_everything_is_initialised, test_task.check_partial_reset):
-            check(env)
+        for check in ("check_seeds", "check_everything_is_initialised", "check_partial_reset", "check_company"):
+            getattr(test_task, check)(env)
         test_task.check_overlap(env, resets=20)
     env.close()
 

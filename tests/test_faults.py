@@ -22,10 +22,12 @@ import psutil
 import pytest
 import torch
 from conftest import (
+    ACTIONS,
     NO_VULKAN,
     ROOT,
     SMALL,
     Stop,
+    box,
     crash,
     read_metrics,
     refused,
@@ -149,24 +151,16 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     assert Path("runs/run1/best.pt").read_bytes() == before
 
 
-def test_resume_to_fewer_steps_is_refused(train, in_tmp, capsys):
+def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
+    """Fewer are refused; of a run that is finished the line says so at once. Neither changes the run."""
     metrics, *_ = train(total_timesteps=320 * 4)
-    with pytest.raises(SystemExit) as error:
-        train(total_timesteps=320 * 3, resume="runs/run1")
-    assert error.value.code == 2 and "--total_timesteps" in capsys.readouterr().err
+    for steps, code, words in ((320 * 3, 2, "the run already has 1280 steps"), (320 * 4, 0, "the run is finished")):
+        with pytest.raises(SystemExit) as error:
+            ppo.main(["--resume", "runs/run1", "--total_timesteps", str(steps)])
+        output = capsys.readouterr()
+        assert error.value.code == code and words in output.err + output.out
+        assert "--total_timesteps" in output.err + output.out
     assert read_metrics(in_tmp / "runs/run1") == metrics
-
-
-def test_a_row_that_was_cut_off_is_dropped(train, in_update, in_tmp):
-    """As a kill -9 while the disk is full leaves it."""
-    in_update(5, crash)
-    with pytest.raises(Stop):
-        train(**RUN)
-    last, path = ppo.load_checkpoint("runs/run1/last.pt"), Path("runs/run1/metrics.jsonl")
-    path.write_bytes(path.read_bytes()[: last["metrics_size"]] + b'{"kind": "train", "glob')
-    ppo.save_checkpoint(Path("runs/run1/last.pt"), last | {"metrics_size": last["metrics_size"] + 300})
-    metrics, *_ = train(**RUN, resume="runs/run1")
-    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
 
 
 def test_checkpoint_minutes(train, in_update, in_tmp):
@@ -224,7 +218,7 @@ def test_non_finite_steps_skip_one_update(train, in_tmp, monkeypatch, capsys, qu
     metrics, last, _ = train(**RUN | dict(save_freq=1))
     assert [row["update_skipped"] for row in metrics if row["kind"] == "train"] == [0, 0, 1] + [0] * 9
     output = capsys.readouterr().out
-    assert re.search(rf"^iteration 3: non-finite .*{quantity}.* in environments \[3, 7\]", output, re.M)
+    assert "iteration 3: no update: non-finite observation or reward in environments [3, 7]\n" in output
     assert output.count("non-finite") == 1
     before, after, later = [ppo.load_checkpoint(f"runs/run1/iteration_{i}.pt") for i in (2, 3, 4)]
     assert same_weights(before, after) and not same_weights(after, later)
@@ -233,32 +227,31 @@ def test_non_finite_steps_skip_one_update(train, in_tmp, monkeypatch, capsys, qu
     assert last["global_step"] == 12 * 320
 
 
-def test_non_finite_gradient_is_taken_back(train, in_tmp, monkeypatch, capsys):
-    """In the middle of an update that had begun to change the weights."""
+def test_an_update_that_spoils_the_weights_ends_the_run(train, in_tmp, monkeypatch):
+    """last.pt holds the weights before it, also where it had begun to change them."""
     update, calls = ppo.update_minibatch, []
 
-    def overflowing(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values):
+    def overflowing(agent, optimizer, args, *, returns, **others):
         calls.append(1)
         if len(calls) == 8 * 4 + 5:
             returns = returns * 1e38 * 1e38
-        return update(agent, optimizer, args, obs, actions, logprobs, advantages, returns, values)
+        return update(agent, optimizer, args, returns=returns, **others)
 
     monkeypatch.setattr(ppo, "update_minibatch", overflowing)
-    metrics, last, _ = train(**RUN | dict(save_freq=1))
-    assert [row["update_skipped"] for row in metrics if row["kind"] == "train"] == [0] * 4 + [1] + [0] * 7
-    assert "iteration 5: non-finite loss, gradient or normalisation" in capsys.readouterr().out
-    before, after, later = [ppo.load_checkpoint(f"runs/run1/iteration_{i}.pt") for i in (4, 5, 6)]
-    assert same_weights(before, after) and not same_weights(after, later)
-    assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {11 * 8}
+    with pytest.raises(ppo.RunError, match="weights that are not finite"):
+        train(**RUN | dict(save_freq=1))
+    last, before = [ppo.load_checkpoint(f"runs/run1/{name}.pt") for name in ("last", "iteration_4")]
+    assert last["iteration"] == 4 and same_weights(last, before)
     assert all(torch.isfinite(x).all() for x in last["agent"].values())
+    assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {4 * 8}
 
 
-def test_normalisation_stays_finite(train, in_tmp, monkeypatch):
-    """Observations that are finite while their squares are not."""
+def test_observations_too_large_to_be_squared_end_the_run(train, in_tmp, monkeypatch):
     poison(monkeypatch, "observation", at=[25], value=1e30)
-    metrics, last, _ = train(**RUN)
-    assert sum(row.get("update_skipped", 0) for row in metrics) >= 1
-    assert all(torch.isfinite(x).all() for x in last["agent"].values())
+    with pytest.raises(ppo.RunError, match="not finite"):
+        train(**RUN)
+    last = ppo.load_checkpoint("runs/run1/last.pt")
+    assert last["iteration"] == 2 and all(torch.isfinite(x).all() for x in last["agent"].values())
 
 
 def test_numbers_that_stay_non_finite_end_the_run(train, in_tmp, monkeypatch):
@@ -273,46 +266,40 @@ def test_numbers_that_stay_non_finite_end_the_run(train, in_tmp, monkeypatch):
 # --- files ---
 
 
-def test_full_disk_does_not_end_the_run_at_once(train, in_update, in_tmp, capsys):
-    """/dev/full in place of the file that is written beside: the old checkpoint stays, then a new one is written."""
-    beside = Path("runs/run1/last.tmp")
-    in_update(1, lambda: beside.symlink_to("/dev/full"))
-    in_update(7, lambda: beside.unlink())
-    seen = {}
-    in_update(6, lambda: seen.update(ppo.load_checkpoint("runs/run1/last.pt")))
-    _, last, code = train(**RUN)
-    assert code == 0 and last["iteration"] == 12 and seen["iteration"] == 0
-    output = capsys.readouterr().out
-    assert output.count("last.pt could not be written") == 2 and os.strerror(errno.ENOSPC) in output
+def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, monkeypatch, capsys):
+    """/dev/full in place of the file that is written first: one line, and the old checkpoint stays whole."""
+    monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
+    in_update(1, lambda: Path("runs/x/last.tmp").symlink_to("/dev/full"))
+    flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
+    flags += "--checkpoint_freq 3 --eval_freq 4 --exp_name x --no-cuda --no-capture_video --desired_kl None"
+    assert ppo.main(flags.split()) == 1
+    errors = capsys.readouterr().err
+    assert os.strerror(errno.ENOSPC) in errors and "last.pt is safe" in errors and "Traceback" not in errors
+    assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 0
+    Path("runs/x/last.tmp").unlink()
+    assert ppo.main(["--resume", "runs/x"]) == 0
+    assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 12
 
 
-def test_disk_that_stays_full_ends_the_run(train, in_update, in_tmp):
-    in_update(1, lambda: Path("runs/run1/last.tmp").symlink_to("/dev/full"))
-    with pytest.raises(ppo.RunError, match="last.pt could not be written 5 times in a row"):
-        train(**RUN | dict(total_timesteps=320 * 40))
-    assert ppo.load_checkpoint("runs/run1/last.pt")["iteration"] == 0
-
-
-def test_metrics_survive_a_full_disk(train, in_update, in_tmp, capsys):
-    """Rows that could not be written are written later, in order; TensorBoard's are made anew from them."""
+def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
+    """Where metrics.jsonl cannot grow: the run ends, and goes on later without a gap or a broken row."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill():
         resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + 100, unlimited[1]))
 
     in_update(3, fill)
-    in_update(6, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, unlimited))
     try:
-        metrics, last, code = train(**RUN)
+        with pytest.raises(OSError):
+            train(**RUN)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert ppo.load_checkpoint("runs/run1/last.pt")["iteration"] == 3
+    metrics, last, code = train(**RUN, resume="runs/run1")
     assert code == 0 and last["iteration"] == 12
-    assert capsys.readouterr().out.count("metrics.jsonl could not be written") == 4
     assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
-    losses = [(row["global_step"], row["value_loss"]) for row in metrics if row["kind"] == "train"]
-    shown = scalars("runs/run1")["train/value_loss"]
-    assert [x for x, _ in shown] == [x for x, _ in losses]
-    assert [y for _, y in shown] == pytest.approx([y for _, y in losses])
+    losses = {row["global_step"]: row["value_loss"] for row in metrics if row["kind"] == "train"}
+    assert scalars("runs/run1")["train/value_loss"] == pytest.approx(losses)
 
 
 class Foreign:
@@ -334,24 +321,25 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, flag, how, c
         path.write_bytes(content[: len(content) // 2 if how == "truncated" else 0])
     elif how == "foreign":
         torch.save({"state_dict": {}}, path)
-        message = "bad.pt.*lacks"
+        message = "bad.pt.*another version"
     elif how == "code":
         torch.save(checkpoint | {"agent": Foreign()}, path)
     elif how == "older":
-        torch.save({k: v for k, v in checkpoint.items() if k != "metrics_size"}, path)
-        message = "bad.pt.*lacks metrics_size"
+        torch.save({k: v for k, v in checkpoint.items() if k != "finished"}, path)
+        message = "bad.pt.*another version"
     elif how == "directory":
         path.mkdir()
     elif how == "task":
-        checkpoint["agent"]["actor_features.0.weight"] = torch.zeros(256, 42)
+        checkpoint["agent"]["actor_mean.0.0.weight"] = torch.zeros(256, 42)
         torch.save(checkpoint, path)
-        message = r"bad.pt.*PushCube-v1.*expected \(256, 35\), found \(256, 42\)"
+        message = r"bad.pt is of another network or task: .* is \(256, 42\) there, \(256, 35\) here"
     elif how == "network":
         checkpoint["agent"]["actor_extra.weight"] = torch.zeros(3)
         torch.save(checkpoint, path)
-        message = r"bad.pt.*actor_extra.weight: expected None, found \(3,\)"
+        message = r"bad.pt.*actor_extra.weight is \(3,\) there, nothing here"
     before = sorted(Path("runs").rglob("*"))
-    arguments = {"--resume": ["--resume", path], "--checkpoint": ["--checkpoint", path, "--num_envs", 1],
+    arguments = {"--resume": ["--resume", path, "--total_timesteps", 800],
+                 "--checkpoint": ["--checkpoint", path, "--num_envs", 1],
                  "--evaluate": ["--evaluate", "--checkpoint", path, "--num_eval_envs", 1]}[flag]  # fmt: skip
     arguments += ["--num_actors", 1]
     with pytest.raises(SystemExit) as error:
@@ -362,17 +350,34 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, flag, how, c
     assert sorted(Path("runs").rglob("*")) == before
 
 
-def test_resume_refuses_other_flags_but_those_that_may_change(trained, in_tmp, capsys):
+def test_flags_of_a_resumed_run(trained, in_tmp, capsys):
+    """The command line wins, except over what fixes the task and the network; what changes is printed."""
     shutil.copytree(trained[0], "runs/x")
-    for flags in ("--gamma 0.9", "--num_envs 8", "--env_id PickCube-v1", "--seed 3", "--no-norm_obs", "--exact_resume",
-                  "--evaluate", "--checkpoint runs/x/best.pt"):  # fmt: skip
+    for flags in ("--env_id PickCube-v1", "--no-norm_obs", "--control_mode pd_joint_pos", "--evaluate",
+                  "--checkpoint runs/x/best.pt"):  # fmt: skip
         with pytest.raises(SystemExit) as error:
             ppo.parse_args(["--resume", "runs/x", *flags.split()])
         assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
-    args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --save_freq 7 --track".split())
-    assert (args.total_timesteps, args.eval_freq, args.save_freq, args.track) == (1000, 3, 7, True)
+    args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --gamma 0.9 --learning_rate 1".split())
+    assert (args.total_timesteps, args.eval_freq, args.gamma, args.learning_rate) == (1000, 3, 0.9, 1)
     assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 4, 1)
     assert ppo.find_run_dir(args) == Path("runs/x")
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("changed: ") and "--gamma 0.9 (was 0.8)" in line and line.count("was") == 4
+
+
+def test_learning_rates_of_a_resumed_run(device):
+    """One that was adapted goes on from where it was; a changed flag starts from its value."""
+    args = ppo.Args(learning_rate=1e-3, desired_kl=0.01)
+    agent = ppo.Agent(box(4), ACTIONS, args).to(device)
+    saved = ppo.make_optimizer(agent, args, device)
+    ppo.adapt_learning_rate(saved, torch.tensor(1.0, device=device), 0.01)
+    state = saved.state_dict()
+    for flags, rates in ((dict(), [1e-3 / 1.5, 1e-3 / 1.5, 1e-3]), (dict(learning_rate=2e-3), [2e-3] * 3)):
+        args = replace(args, **flags)
+        optimizer = ppo.make_optimizer(agent, args, device)
+        ppo.load_optimizer(optimizer, state)
+        assert [group["lr"].item() for group in optimizer.param_groups] == pytest.approx(rates)
 
 
 # --- processes ---
@@ -382,13 +387,18 @@ TINY = ("--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 1, "--num_eval_ep
         "--total_timesteps", 10**6)  # fmt: skip
 
 
+def shared_files():
+    """Without semaphores, which the processes of other tests create meanwhile."""
+    return {path for path in Path("/dev/shm").glob("*") if not path.name.startswith("sem.mp-")}
+
+
 @pytest.fixture
 def start(tmp_path):
     """Start the script in a process group of its own, wait until it trains; what it leaves behind is a defect."""
     started = []
 
     def run(*flags, wait_for_rows=2, **environment):
-        shared_memory = set(Path("/dev/shm").glob("*"))
+        shared_memory = shared_files()
         process = subprocess.Popen(
             [sys.executable, str(ROOT / "ppo.py"), *map(str, flags)],
             cwd=tmp_path, env={**os.environ, **NO_VULKAN, "PYTHONPATH": str(tmp_path), **environment},
@@ -411,7 +421,7 @@ def start(tmp_path):
         for child in alive:
             child.kill()
         assert not alive, f"left behind: {alive}"
-        assert set(Path("/dev/shm").glob("*")) <= shared_memory
+        assert shared_files() <= shared_memory
 
 
 def test_signals_finish_the_iteration(train, in_update, in_tmp):
@@ -459,7 +469,7 @@ def test_dead_actor_ends_the_run(start, tmp_path):
     begun = time.monotonic()
     output, errors = process.communicate(timeout=30)
     assert process.returncode == 1 and time.monotonic() - begun < 10
-    assert "ppo.py: actor 1 died with exit code -9 (killed; out of memory?)" in errors
+    assert "ppo.py: the process of an actor died (killed? out of memory?)" in errors
     assert "runs/x/last.pt is safe" in errors and "--resume runs/x" in errors and "Traceback" not in output + errors
     assert (
         ppo.load_checkpoint(tmp_path / "runs/x/last.pt")["iteration"]
@@ -503,14 +513,13 @@ def write_task(monkeypatch, name, **parts):
 
 @pytest.mark.parametrize("in_main_process", [True, False])
 def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
-    """In actor 0, then in the other one: the same traceback, of the task, and nothing else."""
+    """In actor 0, then in the other one: the traceback of the task."""
     name = "Mistaken" + "Main" * in_main_process
     task = write_task(monkeypatch, name, fault="raise ValueError('my own mistake')", in_main_process=in_main_process)
     assert ppo.main([*map(str, (*TINY, *task))]) == 1
     errors = capfd.readouterr().err
     assert re.search(rf"(?s){name.lower()}.py.*ValueError: my own mistake", errors), errors
-    assert ("actor 1 failed:" in errors) == (not in_main_process)
-    assert "last.pt is safe" in errors and errors.count("Traceback") == 1
+    assert "last.pt is safe" in errors
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 1
 
 
@@ -531,7 +540,7 @@ def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_p
     rows = [row for row in read_metrics(in_tmp / "runs/x") if row["kind"] == "train"]
     output = capfd.readouterr()
     assert [row["update_skipped"] for row in rows] == [1, 0, 0, 0], output
-    assert f"in environments [{1 if in_main_process else 3}]: no update" in output.out
+    assert f"no update: non-finite observation or reward in environments [{1 if in_main_process else 3}]" in output.out
     # ends after 50 and 100 steps; the one that began after 30 ends after 80
     assert [row["num_episodes"] for row in rows] == [0, 3, 1, 3]
     assert all(math.isfinite(row.get("return", 0)) for row in rows)
@@ -556,7 +565,7 @@ def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
     metrics, *_ = train(**RUN)
     assert lines == ["ppo.py: another process is writing to runs/run1: stop it first, or choose another --exp_name\n"]
     assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
-    ppo.open_metrics(Path("runs/run1")).close()  # it may be written to again
+    ppo.lock_run(Path("runs/run1")).release()  # it may be written to again
 
 
 @pytest.mark.slow

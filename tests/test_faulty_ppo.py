@@ -55,19 +55,20 @@ class Run:
                 Reach(num_envs), auto_reset=not evaluation, ignore_terminations=evaluation, record_metrics=True
             )
 
-        def spy_rollout(agent, envs, storage, obs, args, sample_action):
+        def spy_rollout(agent, envs, storage, obs, args, act):
             before, obs = copied(agent.state_dict()), obs.clone()
-            result = rollout(agent, envs, storage, obs, args, sample_action)
+            result = rollout(agent, envs, storage, obs, args, act)
             sums = {k: v.item() for k, v in result[1].items()}
             records = dict(first_obs=obs, next_obs=result[0].clone(), storage=copied(storage), before=before)
             self.iterations.append(dict(**records, sums=sums, updates=[]))
             return result
 
-        def spy_update(agent, optimizer, args, *minibatch):
+        def spy_update(agent, optimizer, args, **minibatch):
             rates = [float(group["lr"]) for group in optimizer.param_groups]
-            rows = [x.detach().clone() for x in minibatch]
+            names = ("obs", "actions", "logprobs", "advantages", "returns", "values")
+            rows = [minibatch[name].detach().clone() for name in names]
             statistics = copied({k: v for k, v in agent.state_dict().items() if k.startswith("obs_")})
-            metrics = update(agent, optimizer, args, *minibatch)
+            metrics = update(agent, optimizer, args, **minibatch)
             self.iterations[-1]["updates"].append(
                 dict(rates=rates, rows=rows, statistics=statistics, metrics=metrics.clone())
             )
@@ -86,7 +87,7 @@ class Run:
         monkeypatch.setattr(ppo, "update_minibatch", spy_update)
         monkeypatch.setattr(ppo, "evaluate", spy_evaluate)
         monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)
-        monkeypatch.setattr(ppo, "open_tensorboard", lambda run_dir: Mock())
+        monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter", Mock())
         with contextlib.ExitStack() as closing:
             self.code = ppo.train(copy.copy(args), closing)
         self.folder = ppo.find_run_dir(args)
@@ -180,7 +181,7 @@ def test_learning_rate_follows_the_divergence(run, desired_kl, reached):
     rate, factors = 1e-3, set()
     for update in [update for iteration in record.iterations for update in iteration["updates"]]:
         assert update["rates"] == pytest.approx([rate, 3 * rate, 1e-3], rel=1e-4)
-        kl = update["metrics"][ppo.KL]
+        kl = update["metrics"][ppo.UPDATE_METRICS.index("approx_kl")]
         factor = 2 / 3 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1
         rate = min(max(rate * factor, 1e-5), 1e-2)
         factors.add(factor)

@@ -21,13 +21,14 @@ import ppo_rgb
     [
         ("--env_id PushCub-v1", "PushCube-v1"),
         ("--env_id no.such.module:Task-v1", "no"),
-        ("--env_id PutCarrotOnPlateInScene-v1", "rgb+segmentation"),
+        ("--env_id PutCarrotOnPlateInScene-v1", "download_asset PutCarrotOnPlateInScene-v1"),
         ("--env_id PickSingleYCB-v1", "python -m mani_skill.utils.download_asset PickSingleYCB-v1"),
         ("--env_id AnymalC-Reach-v1", "python -m mani_skill.utils.download_asset anymal_c"),
-        ("--control_mode pd_thoughts", "pd_joint_delta_pos, pd_joint_pos"),
+        ("--control_mode pd_thoughts", "pd_thoughts not in supported modes: ['pd_joint_delta_pos'"),
+        ("--env_id MS-CartpoleBalance-v1 --control_mode pd_ee_delta_pos", "MS-CartpoleBalance-v1: "),
         ("--robot_uids pandaa", "panda"),
-        ("--reward_mode sparse --env_id MS-AntRun-v1", "normalized_dense, dense, none"),
-        ("--obs_mode rgb", "state"),
+        ("--reward_mode sparse --env_id MS-AntRun-v1", "Unsupported reward mode: sparse"),
+        ("--obs_mode rgb", "ppo_rgb.py"),
         ("--num_envs 0", "num_envs"),
         ("--num_actors 0", "num_actors"),
         ("--num_envs 2 --num_actors 3", "--num_actors 3: there are 2 environments"),
@@ -40,19 +41,20 @@ import ppo_rgb
         ("--target_kl nan", "target_kl"),
         ("--stop_at_success 95", "stop_at_success"),
         ("--num_envs 2 --num_steps 3 --num_minibatches 7", "num_minibatches"),
-        ("--total_timesteps 10 --num_envs 4 --num_steps 4", "total_timesteps"),
+        ("--total_timesteps 10 --num_envs 4 --num_steps 4", "--num_envs 4 x --num_steps 4 = 16 steps"),
+        ("--env_id MyTask-v1", "a task in your own file is module:MyTask-v1"),
         ("--sim_backend physx_quantum", "sim_backend"),
         ("--render_backend paper", "render_backend"),
         ("--env_kwargs [1]", "env_kwargs"),
         ("--env_kwargs {", "env_kwargs"),
-        ('--env_kwargs {"colour":1}', "takes no colour, but"),
+        ('--env_kwargs {"colour":1}', "unexpected keyword argument 'colour' (common.py|unexpected keyword argument 'colour' (reg"),
         ('--env_kwargs {"num_envs":1}', "--num_envs"),
-        ('--env_kwargs {"max_episode_steps":-5}', "max_episode_steps -5"),
-        ('--env_kwargs {"max_episode_steps":[1]}', "max_episode_steps [1]"),
-        ("--env_id TwoRobotPickCube-v1 --robot_uids foo", "panda_wristcam"),
+        ('--env_kwargs {"max_episode_steps":-5}', "positive, actually: -5"),
+        ('--env_kwargs {"max_episode_steps":[1]}', "integer, actually"),
+        ("--env_id TwoRobotPickCube-v1 --robot_uids foo", "Agent foo not found"),
         ("--env_id .x:Y", ".x:Y"),
         ("--env_id broken:Task-v1", "ZeroDivisionError"),
-        ("--robot_uids none", "robot_uids"),
+        ("--robot_uids none", "PushCube-v1: "),
         ("--env_id PickCube-v1 --robot_uids xarm6_robotiq", "download_asset xarm6_robotiq"),
         ("--evaluate", "--checkpoint"),
         ("--evaluate --checkpoint nowhere.pt", "nowhere.pt"),
@@ -61,9 +63,9 @@ import ppo_rgb
         ("--resume runs", "runs/last.pt"),
         ("--exp-name there", "--resume runs/there"),
         ("--exp-name ../garbage.pt/x", "garbage.pt"),
-        ("--exp-name " + 300 * "x", "cannot be written"),
+        ("--exp-name " + 300 * "x", "too long"),
         ("--eval_seed 2147483647", "eval_seed"),
-        ("--gama 0.9", "--gama"),
+        ("--gama 0.9", "--gamma"),
         ("--num_envs", "num-envs"),
         ("--num_envs many", "many"),
         pytest.param("--sim_backend physx_cuda --cuda", "CUDA|NVIDIA",
@@ -77,7 +79,9 @@ def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
     monkeypatch.syspath_prepend(in_tmp)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (in_tmp / "runs/there/metrics.jsonl").write_text("{}\n")
-    line = refused(["--no-cuda", "--no-capture_video", *arguments.split()], capsys)
+    small = "--no-cuda --no-capture_video --num_envs 2 --num_actors 1 --num_eval_envs 1 --num_eval_episodes 1 "
+    small += "--num_steps 50 --total_timesteps 100"
+    line = refused([*small.split(), *arguments.split()], capsys)
     assert any(part in line for part in message.split("|")), line
 
 
@@ -98,7 +102,7 @@ def test_physx_without_its_library_is_refused(in_tmp, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("script", [ppo, ppo_rgb])
-def test_one_process_at_a_time_downloads_physx(script, monkeypatch):
+def test_one_process_at_a_time_downloads_physx(script, monkeypatch, tmp_path):
     inside, most = [], []
 
     def enable_gpu():
@@ -108,7 +112,10 @@ def test_one_process_at_a_time_downloads_physx(script, monkeypatch):
         inside.pop()
 
     monkeypatch.setattr(script.sapien.physx, "enable_gpu", enable_gpu)
-    threads = [threading.Thread(target=script.enable_gpu_physics) for _ in range(4)]
+    monkeypatch.setattr(torch, "zeros", lambda *args, **kwargs: None)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    args = script.Args(sim_backend="physx_cuda:0", num_actors=1)
+    threads = [threading.Thread(target=script.check_simulation, args=(args,)) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -135,17 +142,16 @@ def test_driver_too_old_is_told(in_tmp, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "arguments, note",
     [
-        ("--env_id MS-CartpoleSwingUp-v1", "--gamma 0.8 looks 5 steps ahead, and episodes of MS-CartpoleSwingUp-v1"),
-        ("--env_id PlugCharger-v1 --gamma 0.97", "not dense"),
-        ("--reward_mode sparse", "not dense"),
-        ("--num_eval_steps 20", "--num_eval_steps 20 ends before an episode does"),
+        ("--env_id MS-CartpoleSwingUp-v1", "--gamma 0.8 looks 5 steps ahead, and an episode has 1000"),
         ("", None),
         ("--gamma 0.99 --env_id MS-CartpoleSwingUp-v1", None),
     ],
 )  # fmt: skip
-def test_notes(arguments, note, in_tmp, capsys):
-    args = ppo.parse_args(["--no-cuda", *arguments.split()])
-    ppo.check(args)
+def test_note_on_gamma(arguments, note, capsys):
+    args = ppo.parse_args(["--no-cuda", "--num_envs", "1", *arguments.split()])
+    envs = ppo.make_envs(args, 1, 0)
+    ppo.check_task(args, envs, True)
+    envs.close()
     output = capsys.readouterr().out
     assert output.count("note:") == (note is not None) and (note or "") in output
 

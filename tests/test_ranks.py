@@ -48,10 +48,9 @@ def one_step(script, rows, rank, world_size):
     advantages[: rows // 2] = 5 * advantages[: rows // 2] + 2  # the halves differ in mean and scale
     share = slice(rank * rows // world_size, (rank + 1) * rows // world_size)
     batch = [x[share] for x in (actions, logprobs, advantages, returns, values)]
-    obs = {k: v[share] for k, v in script.as_dict(obs).items()}
-    inputs = obs if script is ppo_rgb else obs["state"]
-    metrics = script.average(script.update_minibatch(agent, optimizer, args, inputs, *batch))
-    agent.update_normalization(obs["state"])
+    obs = {k: v[share] for k, v in obs.items()} if script is ppo_rgb else obs[share]
+    metrics = script.average(script.update_minibatch(agent, optimizer, args, obs, *batch))
+    agent.update_normalization(obs["state"] if script is ppo_rgb else obs)
     return {**agent.state_dict(), "metrics": metrics}
 
 
@@ -75,7 +74,7 @@ def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
 
     # one folder, written by the first
     assert sorted(path.name.split(".out")[0] for path in (tmp_path / "runs/x").iterdir()) == [
-        "args.json", "best.pt", "events", "last.pt", "learning_curve.png", "metrics.jsonl"
+        ".lock", "args.json", "best.pt", "events", "last.pt", "learning_curve.png", "metrics.jsonl"
     ]  # fmt: skip
     rows = read_metrics(tmp_path / "runs/x")
     assert [row["global_step"] for row in rows if row["kind"] == "train"] == [320, 640, 960]
@@ -116,7 +115,7 @@ def test_stopped_resumed_and_killed(tmp_path):
     start = time.monotonic()
     output, _ = process.communicate(timeout=60)
     assert time.monotonic() - start < 20
-    assert process.returncode != 0 and "rank 0 lost another process of the run" in output, output
+    assert process.returncode != 0 and "Connection closed by peer" in output, output
     steps = [row["global_step"] for row in read_metrics(folder) if row["kind"] == "train"]
     assert steps == list(range(320, steps[-1] + 1, 320)), "no row twice, none missing"
     assert ppo.load_checkpoint(folder / "last.pt")["global_step"] >= steps[-1] - 320

@@ -67,9 +67,9 @@ def make_agent(obs_space, action_space, args):
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(3)
         agent = ppo.Agent(obs_space, action_space, args)
-        agent.actor_mean.weight *= 40
-        agent.critic.weight *= 3
-        agent.critic.bias += 2
+        agent.actor_mean[-1].weight *= 40
+        agent.critic[-1].weight *= 3
+        agent.critic[-1].bias += 2
         agent.actor_logstd += 0.3 * torch.randn_like(agent.actor_logstd)
         if args.norm_obs:
             size = len(agent.obs_mean)
@@ -85,6 +85,7 @@ class Network:
     def __init__(self, agent):
         self.parameters = {k: v.detach().double().numpy().copy() for k, v in agent.state_dict().items()}
         self.norm_obs, self.logstd = agent.norm_obs, self.parameters["actor_logstd"]
+        self.shared = "features.0.weight" in self.parameters
 
     def normalize(self, obs):
         mean, var = self.parameters["obs_mean"], self.parameters["obs_var"]
@@ -96,11 +97,14 @@ class Network:
             x = np.tanh(x) if i < len(layers) - 1 else x
         return x
 
+    def layers(self, name):
+        return [*(f"features.{i}" if self.shared else f"{name}.0.{i}" for i in (0, 2, 4)), f"{name}.1"]
+
     def mean(self, obs):
-        return self.forward(self.normalize(obs), [*(f"actor_features.{i}" for i in (0, 2, 4)), "actor_mean"])
+        return self.forward(self.normalize(obs), self.layers("actor_mean"))
 
     def value(self, obs):
-        return self.forward(self.normalize(obs), [*(f"critic_features.{i}" for i in (0, 2, 4)), "critic"])[..., 0]
+        return self.forward(self.normalize(obs), self.layers("critic"))[..., 0]
 
 
 def make_storage(args, obs_size, action_size, fill=math.nan):
@@ -158,10 +162,10 @@ def replay(network, args, first_obs, steps, episodes):
                 sums["reward"] += episode["reward"] / episode["steps"]
                 for kind in {"success", "fail"} & info.keys():
                     sums[f"{kind}_once"] += episode[kind]
-                    if not args.partial_reset:
-                        sums[f"{kind}_at_end"] += info[kind]
+                    sums[f"{kind}_at_end"] += info[kind]
                 for key, value in info.items():
-                    sums[f"final_{key}"] += value
+                    if key not in ("success", "fail", "elapsed_steps"):
+                        sums[f"final_{key}"] += value
                 episodes[env] = fresh_episode()
                 obs = step["reset_obs"][env].double().numpy()
         last_obs[env] = obs
@@ -239,11 +243,11 @@ def test_equals_replay(rule, partial_reset, norm_obs):
         spy.steps.clear()
         storage, first_obs = make_storage(args, 4, 2), obs.clone()
         torch.manual_seed(number)
-        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.sample_action)
+        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value)
         assert not any(x.requires_grad for x in [*storage.values(), *sums.values()])
         ends, wanted = compare(agent, args, spy, first_obs, storage, sums, obs, episodes)
         all_ends += ends
-        ended_by += Counter({k: v.item() for k, v in sums.items() if k in ("final_success", "final_fail")})
+        ended_by += Counter({k: v.item() for k, v in sums.items() if k in ("success_at_end", "fail_at_end")})
         # each action is the policy's mean and deviation with fresh noise
         torch.manual_seed(number)
         noise = torch.stack([torch.randn(args.num_envs, 2) for _ in range(args.num_steps)]).double().numpy()
@@ -253,7 +257,7 @@ def test_equals_replay(rule, partial_reset, norm_obs):
             normalized = abs(network.normalize(wanted["obs"]))
             assert normalized.max() == 10 and normalized.min() < 1
     assert set(all_ends) == ({"early", "late", "both"} if partial_reset else {"late"}), "episodes end in every way"
-    assert all(ended_by[k] >= 2 for k in ("final_success", "final_fail"))
+    assert all(ended_by[k] >= 2 for k in ("success_at_end", "fail_at_end"))
 
 
 def test_rollout_without_an_end():
@@ -263,7 +267,7 @@ def test_rollout_without_an_end():
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=True, record_metrics=True)
     agent = make_agent(box(4), spy.get_wrapper_attr("single_action_space"), args)
     first_obs, storage = envs.reset()[0].clone(), make_storage(args, 4, 2)
-    obs, sums = ppo.rollout(agent, envs, storage, first_obs, args, agent.sample_action)
+    obs, sums = ppo.rollout(agent, envs, storage, first_obs, args, agent.get_action_and_value)
     episodes = [fresh_episode() for _ in range(args.num_envs)]
     wanted = replay(Network(agent), args, first_obs, spy.steps, episodes)[0]
     np.testing.assert_allclose(storage["next_values"], wanted["next_values"], rtol=1e-4, atol=1e-4)
@@ -288,7 +292,7 @@ def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
     for _ in range(2):
         spy.steps.clear()
         storage, first_obs = make_storage(args, obs.shape[1], 8), obs.clone()
-        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.sample_action)
+        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value)
         ends, _ = compare(agent, args, spy, first_obs, storage, sums, obs, episodes)
         assert ends["late"] >= args.num_envs
     ended = [step for step in spy.steps if "reset_obs" in step]
@@ -303,7 +307,7 @@ TWO = replace(PUSH, num_envs=4, num_actors=2, num_eval_envs=4, env_kwargs="{}")
 
 def noise_alone(obs):
     """Stands in for the policy: what is stored as the action is the noise itself."""
-    return torch.randn(len(obs), 8), torch.zeros(len(obs))
+    return torch.randn(len(obs), 8), torch.zeros(len(obs)), None, torch.zeros(len(obs))
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +330,8 @@ def actors():
 def noise_of(actor, iteration, seed=TWO.seed, restart=False):
     obs_size = actor.envs.single_observation_space.shape[0]
     storage, actor.args = make_storage(TWO, obs_size, 8), replace(TWO, seed=seed)
-    actor.connect(make_agent(box(obs_size), box(8), TWO), storage, noise_alone)
+    actor.connect(make_agent(box(obs_size), box(8), TWO), storage)
+    actor.act = noise_alone
     actor.rollout(iteration, restart, False)
     actor.args = TWO
     return storage["actions"][:, actor.env_idx.start : actor.env_idx.stop]
@@ -417,7 +422,7 @@ def test_evaluation_builds_the_objects_of_its_seeds():
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
     found, step = [], envs.step
     envs.step = lambda action: found.extend(envs.base_env.peg_half_sizes.tolist()) or step(action)
-    ppo.evaluate(agent, envs, 4, 7, 1, ppo.rebuilding(args), separately=True)
+    ppo.evaluate(agent, envs, 4, 7, 1, ppo.plan_evaluation(envs, args)[2], separately=True)
     single = gym.make(args.env_id, num_envs=1, sim_backend="physx_cpu", render_backend="none", obs_mode="state")
     wanted = []
     for seed in range(7, 11):

@@ -1,9 +1,9 @@
 """Does a task start its episodes as ManiSkill's batches need it? For the examples, some of ManiSkill's, and yours:
 
-    pytest tests/test_task.py --env_id my_module:MyTask-v1
+    pytest PATH/TO/tests/test_task.py --env_id my_module:MyTask-v1
 
-A batch is simulated on the CPU, as ppo.py lets ManiSkill do it, and on `physx_cuda` where there is one; the summary
-says where.
+Run it from the folder of your module; it needs no plugin of pytest. The batch is simulated on the CPU, and on
+`physx_cuda` if there is one; the summary says where.
 """
 
 import os
@@ -121,12 +121,21 @@ def seeds(start):
     return list(range(start, start + NUM_ENVS))
 
 
+OWN_TENSOR = (
+    "self.{0} has {1} rows after a reset of environments {2}. A tensor of your own keeps num_envs rows: allocate it in "
+    "_load_scene, and write self.{0}[env_idx] = ... in _initialize_episode"
+)
+
+
 def reset_some(env, env_idx, **options):
     try:
         return env.reset(options={"env_idx": torch.tensor(env_idx, device=env.unwrapped.device), **options})
     except (RuntimeError, IndexError, ValueError, AssertionError) as error:
         if "reconfigure" in str(error):
             raise
+        for name, value in vars(env.unwrapped).items():
+            if isinstance(value, torch.Tensor) and value.shape[:1] == (len(env_idx),):
+                raise AssertionError(OWN_TENSOR.format(name, len(env_idx), env_idx)) from error
         raise AssertionError(
             f"a reset of environments {env_idx} of {NUM_ENVS} fails: {error}. Whatever _initialize_episode makes must "
             "have len(env_idx) rows, not num_envs"
@@ -163,6 +172,21 @@ def check_seeds(env):
             assert not alike, f"the {name} is random, but the same in all environments: draw len(env_idx) rows"
 
 
+def check_company(env):
+    """An episode follows from its own seed, whatever the seeds of the other environments are."""
+    row, first, second = 2, seeds(5), seeds(500)
+    second[row] = first[row]
+    starts = []
+    for numbers in (first, second):
+        env.reset(seed=numbers)
+        starts.append({k: v[row] for k, v in placed(rows_of(env, everything(env))).items()})
+    for name, value in starts[0].items():
+        assert torch.allclose(value.double(), starts[1][name].double(), atol=1e-5, equal_nan=True), (
+            f"the {name} of one seed depends on the seeds of other environments: draw from "
+            "self._batched_episode_rng[env_idx], not from torch.rand, and pass enhanced_determinism=True"
+        )
+
+
 def check_everything_is_initialised(env):
     """Nothing is left over from the episode before."""
     env.reset(seed=seeds(5))
@@ -185,9 +209,8 @@ def check_partial_reset(env):
         after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
         exact = ppo.is_batch(env.unwrapped.scene)  # on the CPU; a GPU may compute last bits anew
         for name in rows_of(env, before):
-            assert before[name].shape == after[name].shape, (
-                f"the {name} has shape {tuple(after[name].shape)} after a reset of environments {env_idx}: write to "
-                "its rows, [env_idx]"
+            assert before[name].shape == after[name].shape, OWN_TENSOR.format(
+                name.removeprefix("attribute "), len(after[name]), env_idx
             )
             assert torch.allclose(
                 before[name][others].double(), after[name][others].double(), atol=0 if exact else 1e-5, equal_nan=True
@@ -316,6 +339,14 @@ def test_observations(envs):
 
 def test_seeds(envs):
     check_seeds(envs)
+
+
+def test_company(envs, env_id):
+    if env_id in MANISKILL:  # these draw from torch.rand
+        with pytest.raises(AssertionError, match="depends on the seeds of other environments"):
+            check_company(envs)
+    else:
+        check_company(envs)
 
 
 def test_everything_is_initialised(envs):

@@ -15,7 +15,7 @@ def make(**flags):
     args = ppo.Args(learning_rate=1e-2, **flags)
     agent = ppo.Agent(box(OBS), box(ACT), args).double()
     with torch.no_grad():
-        agent.actor_mean.weight *= 50  # far from the initial, nearly constant policy
+        agent.actor_mean[-1].weight *= 50  # far from the initial, nearly constant policy
         agent.actor_logstd += 0.1 * torch.randn(1, ACT)
     batch = dict(
         obs=torch.randn(ROWS, OBS).double(),
@@ -42,8 +42,11 @@ def reference_loss(args, agent, b):
     x = b["obs"]
     if args.norm_obs:
         x = ((x - agent.obs_mean) / (agent.obs_var + 1e-5).sqrt()).clamp(-10, 10)
-    mean = mlp(agent.actor_features, x) @ agent.actor_mean.weight.T + agent.actor_mean.bias
-    value = (mlp(agent.critic_features, x) @ agent.critic.weight.T + agent.critic.bias)[:, 0]
+    if args.shared_features:
+        x = mlp(agent.features, x)
+    actor, critic = agent.actor_mean, agent.critic
+    mean = (x if args.shared_features else mlp(actor[0], x)) @ actor[1].weight.T + actor[1].bias
+    value = ((x if args.shared_features else mlp(critic[0], x)) @ critic[1].weight.T + critic[1].bias)[:, 0]
     std = agent.actor_logstd.exp()
     logprob = (-0.5 * ((b["actions"] - mean) / std) ** 2 - agent.actor_logstd - 0.5 * np.log(2 * np.pi)).sum(1)
     ratio = (logprob - b["logprobs"]).exp()
@@ -121,6 +124,6 @@ def test_initial_policy_is_nearly_zero_and_deterministic_action_is_its_mean():
     obs = torch.randn(64, OBS)
     assert agent.get_action(obs).abs().max() < 0.1
     torch.manual_seed(0)
-    samples = torch.stack([agent.sample_action(obs)[0] for _ in range(2000)])
+    samples = torch.stack([agent.get_action_and_value(obs)[0] for _ in range(2000)])
     torch.testing.assert_close(samples.mean(0), agent.get_action(obs), atol=0.08, rtol=0)
     assert agent.get_value(obs).shape == (64,)

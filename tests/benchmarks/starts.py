@@ -16,7 +16,6 @@ import torch
 
 env_id, path = sys.argv[1:]
 args = ppo.Args(env_id=env_id, sim_backend="physx_cpu", render_backend="cpu")
-ppo.prepare_rendering(args)
 env = gym.make(
     env_id, render_mode="rgb_array", render_backend=args.render_backend, sim_backend="physx_cpu",
     human_render_camera_configs=dict(width=192, height=192),
