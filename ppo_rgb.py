@@ -140,7 +140,7 @@ class EnvironmentArgs:
     obs_mode: str = "rgb"
     """textures of the cameras' images, joined by +: rgb, depth, segmentation, position, normal, albedo"""
     include_state: bool = True
-    """see the robot's state too, and whatever else the task shows beside images; --no-include_state: images alone"""
+    """see the robot's state too, and whatever else the task shows besides images; --no-include_state: images alone"""
     frame_stack: int = 1
     """see the last so many observations together"""
     camera_width: Optional[int] = None
@@ -929,14 +929,14 @@ class ImageObservations(FlattenRGBDObservationWrapper):
         textures = args.obs_mode.split("+")
         self.others = [k for k in textures if k not in ("rgb", "depth")]
         self.num_frames, self.frames, self.latest = args.frame_stack, {}, {}
+        if not env.unwrapped._init_raw_obs["sensor_data"]:
+            raise RunError("neither the task nor its robot has a camera; ppo.py learns from the state")
         super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
 
     def observation(self, observation: dict, new_episodes=None) -> dict:
         cameras = observation["sensor_data"].values()
-        sizes = {tuple(x.shape[1:3]) for camera in cameras for x in camera.values()}
-        if len(sizes) != 1:
-            raise RunError(f"cameras of sizes {sizes or 'none'}: give --camera_width and --camera_height" if sizes else
-                           "neither the task nor its robot has a camera; ppo.py learns from the state")  # fmt: skip
+        if len({x.shape[1:3] for camera in cameras for x in camera.values()}) > 1:
+            raise RunError("the sizes of the cameras differ: give --camera_width and --camera_height")
         latest = super().observation(observation)
         latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
         if "segmentation" in latest:

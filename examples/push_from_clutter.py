@@ -2,17 +2,16 @@
 
     python ppo.py --env_id examples.push_from_clutter:PushFromClutter-v1
 
-On 2 CPU cores 250,000 steps, the default, took 13 to 17 minutes (other work ran beside); 58, 61 and 57 of 64 evaluation
-episodes succeeded (seeds 1 to 3), and 240, 246 and 249 of 256 others.
+After --total_timesteps 250000, 58, 61 and 57 of 64 evaluation episodes succeeded, and 240, 246 and 249 of 256 others
+(seeds 1 to 3, measured with an earlier version).
 
-What it teaches, beside examples/push_to_goal.py:
+It teaches more than examples/push_to_goal.py:
 
 * Placing without overlap, with ManiSkill's UniformPlacementSampler: see `_free_places`.
-* Domain randomisation. Sizes, masses and friction differ between environments, and belong in `_load_scene`: in a batch
-  on a GPU they cannot change once the simulation has started, so a thousand environments have a thousand different
-  scenes for good (colours could change; they are part of a look that is made there too). A scene of one environment, as
-  on a CPU, is rebuilt now and then instead: see `reset` and `reconfiguration_freq`, and on a GPU evaluate with
-  `--eval_reconfiguration_freq 1`. Poses, velocities and goals belong in `_initialize_episode`.
+* Domain randomisation. Sizes, masses and friction differ between environments and belong in `_load_scene`: on a GPU
+  they cannot change once the simulation has started, so a thousand environments have a thousand different scenes for
+  good. A scene of one environment is rebuilt now and then instead: see `reset` and `reconfiguration_freq`. Poses,
+  velocities and goals belong in `_initialize_episode`.
 """
 
 import sapien
@@ -56,8 +55,8 @@ class PushFromClutterEnv(PushToGoalEnv):
         )  # fmt: skip
 
     def _build_block(self, k):
-        """Block k of all environments: one built for each, then joined so that the task can handle them as one. The
-        numbers are from each environment's own generator, which is seeded before scenes are built too."""
+        """Block k of all environments: builds one for each, then joins them so that the task handles them as one. The
+        numbers come from each environment's own generator, which ManiSkill seeds before it builds scenes."""
         blocks = []
         for i in range(self.num_envs):
             half_size, friction, density, red, green, blue = self._batched_episode_rng[i].uniform(
@@ -74,7 +73,7 @@ class PushFromClutterEnv(PushToGoalEnv):
             blocks.append(builder.build(name=f"block {k} of environment {i}"))
             self.half_sizes[i, k] = half_size
         joined = Actor.merge(blocks, name=f"block {k}")
-        # The scene is to know the joined one only: it loops over its actors at each reset, and saves them in states.
+        # Let the scene know the joined one only: it loops over its actors at each reset, and saves them in states.
         for block in blocks:
             self.remove_from_state_dict_registry(block)
             del self.scene.actors[block.name]
@@ -85,9 +84,9 @@ class PushFromClutterEnv(PushToGoalEnv):
     def _free_places(self, half_sizes, rng):
         """Centres (n, 2) of n blocks that do not overlap, however they are turned; nan for one that finds no place.
 
-        The sampler draws from torch's global generator, as often as the fullest environment of its batch needs: one
-        for each environment, seeded from its own generator, keeps its episodes independent of the others. It takes
-        about a millisecond for each environment that resets."""
+        The sampler draws from torch's global generator, as often as the fullest environment of its batch needs. One
+        sampler for each environment, seeded from its own generator, keeps its episodes independent of the others. It
+        takes about a millisecond for each environment that resets."""
         radii = half_sizes * 2**0.5
         with torch.random.fork_rng(devices=[]):  # puts the global generator back afterwards
             torch.default_generator.manual_seed(int(rng.randint(2**31)))

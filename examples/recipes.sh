@@ -3,9 +3,9 @@
 #
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
-# 'Measured' is on 2 cores of a shared x86-64 machine without a GPU, training time at 500 to 1,100 steps/s; the rest of
-# the numbers are in README.md. All but PushCube's and PickCube's are of an earlier version, with its defaults. 'Not
-# measured here' means just that: the flags are a start, not a result.
+# 'Measured' is on 2 cores of a shared x86-64 machine without a GPU; tests/benchmarks/README.md has more. All but
+# PushCube's and PickCube's were measured with an earlier version. 'Not measured here': the flags are a start, not a
+# result.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -46,7 +46,7 @@ cartpole_balance_images_cpu() {
         --gamma 0.99 --gae_lambda 0.95 --total_timesteps 72000 --num_eval_episodes 8 --eval_freq 15 "$@"
 }
 
-# Measured, seed 1: success_once 0.125 (training 0.15 to 0.25) after 80,000 steps, 51 min: on its way, not learned yet.
+# Measured, seed 1: success_once 0.125 (training 0.15 to 0.25) after 80,000 steps, 51 min: not learned yet.
 push_cube_images_cpu() {
     python ppo_rgb.py --env_id PushCube-v1 --no-cuda --camera_width 64 --camera_height 64 --total_timesteps 80000 \
         --eval_freq 10 --num_eval_episodes 16 "$@"
@@ -72,7 +72,7 @@ cartpole_swing_up_gpu() {
         --eval_freq 5 "$@"
 }
 
-# --- images, GPU: not measured here; ManiSkill's flags too ---
+# --- images, GPU: not measured here; also ManiSkill's flags ---
 
 push_cube_images_gpu() {
     python ppo_rgb.py --env_id PushCube-v1 --num_envs 256 --update_epochs 8 --num_minibatches 8 \

@@ -46,7 +46,7 @@ DIFFERENT = {
     (
         "Empty-v1",
         "obs/agent/fsr_impulse",
-    ): "of a contact between two sensors, a single environment tells the first only",
+    ): "a single environment reports a contact between two sensors for the first one only",
     ("PullCubeTool-v1", "info/cube_distance"): "the mean over all environments",
     ("PullCubeTool-v1", "info/cube_progress"): "the mean over all environments",
 }
@@ -180,7 +180,7 @@ def differences(env_id, batched, single, row, num_envs):
 
 
 def sample(env, rng):
-    """Random actions, of which each row is its own."""
+    """Random actions, different in each row."""
     spaces = env.action_space.spaces if isinstance(env.action_space, gym.spaces.Dict) else {"": env.action_space}
     actions = {
         k: torch.from_numpy(rng.uniform(np.maximum(s.low, -3), np.minimum(s.high, 3)).astype(np.float32))
@@ -608,7 +608,7 @@ def trajectory():
 
 @pytest.mark.slow
 def test_single_environments_are_untouched(build, tmp_path):
-    """Beside a batch, too: compared with a ppo.py that does not call batch_on_cpu."""
+    """Also in the same process as a batch: compared with a ppo.py that does not call batch_on_cpu."""
     source = (ROOT / "ppo.py").read_text()
     assert source.count("\nbatch_on_cpu()\n") == 1
     (tmp_path / "ppo.py").write_text(source.replace("\nbatch_on_cpu()\n", "\nsapien_env.BaseEnv.build_seed = 2022\n"))

@@ -69,7 +69,7 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
     for key in ("success_once", "success_at_end", "return", "episode_len"):
         low, high = results[f"{key}_interval"]
         assert low <= results[key] <= high and f"{results[key]:.3f}" in output
-    assert not list(tmp_path.iterdir()), "nothing is written but beside the checkpoint"
+    assert not list(tmp_path.iterdir()), "everything is written next to the checkpoint"
     # the last evaluation of the training run, once more; PhysX remembers contacts of the episodes before
     assert ppo.main([*map(str, command), "--num_eval_episodes", "6", "--num_eval_envs", "2"]) == 0
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])

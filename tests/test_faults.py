@@ -71,7 +71,7 @@ def test_exact_resume_is_bit_identical(train, in_update, in_tmp, iteration, acti
 
 
 def test_exact_resume_with_gpu_simulation(train, in_update, in_tmp, monkeypatch, device):
-    """Where scenes are not built anew: episodes start at the same iterations, stopped or not."""
+    """Where scenes are not built again: episodes start at the same iterations, stopped or not."""
     monkeypatch.setattr(ppo, "choose_device", lambda args: device)
     flags = RUN | dict(exact_resume=True, sim_backend="physx_cuda")
     train(**flags)
@@ -525,7 +525,7 @@ def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
 
 @pytest.mark.parametrize("in_main_process", [True, False])
 def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_process):
-    """A cube at nowhere in one environment of a real batch: that environment starts anew, the others go on, and one
+    """A cube at nowhere in one environment of a real batch: that environment starts a new episode, the others go on, and one
     update is skipped."""
     fault = """
             from mani_skill.utils.structs import Pose
@@ -581,7 +581,7 @@ def test_many_environments_start(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("num_envs, num_actors, signum", [(3, 2, signal.SIGTERM), (3, 1, signal.SIGKILL)])
 def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch, num_envs, num_actors, signum):
-    """Two actors, of which one has a single environment, and one actor: stopped by kill -9 or a signal, the same to the
+    """Two actors, one of them with a single environment, and one actor: stopped by kill -9 or a signal, the same to the
     last bit as never stopped."""
     monkeypatch.chdir(tmp_path)
     flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_actors", num_actors,

@@ -83,7 +83,7 @@ def test_observations_are_maniskills(env_id, obs_mode, flags):
 
 @pytest.mark.render
 def test_view():
-    """Every texture can be filmed, beside the scene or without one."""
+    """Every texture can be filmed, next to the scene or without it."""
     args = replace(
         ARGS, env_id="MS-CartpoleBalance-v1", obs_mode=ALL_TEXTURES, shader="default", camera_width=40,
         camera_height=40, frame_stack=2,
@@ -280,7 +280,7 @@ def test_all_options_train(train):
 
 @pytest.mark.slow
 def test_learns_from_images(train):
-    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just beside it, so that 32
+    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just next to it, so that 32
     evaluation episodes differ by 0.1 with the rounding of another number of threads. Training ends hundreds."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
     metrics, *_ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)

@@ -207,7 +207,7 @@ def check_partial_reset(env):
         before = everything(env)
         reset_some(env, env_idx)
         after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
-        exact = ppo.is_batch(env.unwrapped.scene)  # on the CPU; a GPU may compute last bits anew
+        exact = ppo.is_batch(env.unwrapped.scene)  # on the CPU; a GPU may compute other last bits
         for name in rows_of(env, before):
             assert before[name].shape == after[name].shape, OWN_TENSOR.format(
                 name.removeprefix("attribute "), len(after[name]), env_idx

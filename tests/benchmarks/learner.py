@@ -1,4 +1,4 @@
-"""What ppo.py takes beside the simulation: its update, and its rollout beyond the environments' steps.
+"""What ppo.py takes besides the simulation: its update, and its rollout beyond the environments' steps.
 
     uv run tests/benchmarks/learner.py                                  # on a GPU
     uv run tests/benchmarks/learner.py --no-cuda --shapes 16x100 --num_minibatches 8        # on a CPU
@@ -124,7 +124,7 @@ def main():
     parser.add_argument("--update_epochs", type=int, default=8)
     parser.add_argument("--variants", nargs="+", default=None, choices=VARIANTS)
     parser.add_argument("--repetitions", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=8, help="of each run, of which the first three warm up")
+    parser.add_argument("--iterations", type=int, default=8, help="iterations of each run; the first three warm up")
     parser.add_argument("--no-cuda", action="store_true")
     options = parser.parse_args()
     ppo.make_envs = make_envs

@@ -21,7 +21,7 @@ SCRIPT = Path(__file__).parents[2] / "ppo.py"
 
 
 def steps_per_second(ranks, options):
-    """Medians over iterations, of which the first two warm up: all, rollout phase, update phase."""
+    """Medians over iterations after two that warm up: all, rollout phase, update phase."""
     with tempfile.TemporaryDirectory() as folder:
         steps = next((int(a) for f, a in zip(options.flags, options.flags[1:]) if f == "--num_steps"), 50)
         batch = options.num_envs * steps * ranks

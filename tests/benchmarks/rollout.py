@@ -9,7 +9,7 @@ The candidates take turns, several repetitions of each, since a shared machine d
   single, batch    one process, random actions, one environment, 16 and 32
   rollout phase    of ppo.py with the trained policy, on all cores, as ppo.py itself logs it
   base             the same of the ppo.py in the folder --base
-  physics alone    on all cores at once: what those rollouts told the physics systems is told them again, from the same
+  physics alone    on all cores at once: the calls that those rollouts made to the physics systems, again, from the same
                    states, and nothing but their step() is timed
 """
 
@@ -65,7 +65,7 @@ def rollout_phase(script, checkpoint, iterations):
 
 
 class Recorder:
-    """Notes what a batch's physics systems are told, step by step, and tells them again."""
+    """Records the calls to a batch's physics systems, step by step, and repeats them."""
 
     def __init__(self, px):
         self.px, self.log, self.step, self.known = px, [], px.step, None

@@ -1,4 +1,4 @@
-"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3, and beside other work.
+"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3, and next to other work.
 
     uv run --group benchmark tests/benchmarks/throughput.py
 
