@@ -396,12 +396,13 @@ class Agent(nn.Module):
         act_dim = action_space.shape[0]
         state_dim = obs_space["state"].shape[0] if "state" in obs_space.spaces else 0
         self.encoder = Encoder(obs_space, args)
+        self.state_layer = layer_init(nn.Linear(state_dim, 256)) if state_dim else None
+        num_features = self.encoder.num_features + (256 if state_dim else 0)
 
         def head(size, std):
             return nn.Sequential(
-                layer_init(nn.Linear(self.encoder.num_features + state_dim, 256)), nn.Tanh(),
-                layer_init(nn.Linear(256, 256)), nn.Tanh(),
-                layer_init(nn.Linear(256, size), std),
+                layer_init(nn.Linear(num_features, 512)), nn.ReLU(),
+                layer_init(nn.Linear(512, size), std),
             )  # fmt: skip
 
         self.actor_mean = head(act_dim, 0.01 * math.sqrt(2))
@@ -433,7 +434,9 @@ class Agent(nn.Module):
 
     def get_features(self, obs):
         features = self.encoder(obs)
-        return torch.cat([features, self.normalize(obs["state"])], dim=1) if "state" in obs else features
+        if self.state_layer is None:
+            return features
+        return torch.cat([features, self.state_layer(self.normalize(obs["state"]))], dim=1)
 
     def get_value(self, obs):
         return self.critic(self.get_features(obs)).squeeze(-1)

@@ -525,8 +525,8 @@ def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
 
 @pytest.mark.parametrize("in_main_process", [True, False])
 def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_process):
-    """A cube at nowhere in one environment of a real batch: that environment starts a new episode, the others go on, and one
-    update is skipped."""
+    """A cube at nowhere in one environment of a real batch: that environment starts a new episode, the others go on,
+    and one update is skipped."""
     fault = """
             from mani_skill.utils.structs import Pose
             poses = self.obj.pose.raw_pose.clone()

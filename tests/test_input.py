@@ -47,7 +47,7 @@ import ppo_rgb
         ("--render_backend paper", "render_backend"),
         ("--env_kwargs [1]", "env_kwargs"),
         ("--env_kwargs {", "env_kwargs"),
-        ('--env_kwargs {"colour":1}', "unexpected keyword argument 'colour' (common.py|unexpected keyword argument 'colour' (reg"),
+        ('--env_kwargs {"colour":1}', "unexpected keyword argument 'colour' ("),
         ('--env_kwargs {"num_envs":1}', "--num_envs"),
         ('--env_kwargs {"max_episode_steps":-5}', "positive, actually: -5"),
         ('--env_kwargs {"max_episode_steps":[1]}', "integer, actually"),
