@@ -1742,7 +1742,8 @@ class Logger:
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.lock, self.wandb_run, self.last_line = run_dir, lock_run(run_dir), None, time.monotonic()
         path, size = run_dir / "metrics.jsonl", resumed.get("metrics_size", 0)  # later steps are done again
-        path.write_bytes(path.read_bytes()[:size] if resumed else b"")
+        path.touch()
+        path.write_bytes(path.read_bytes()[:size])
         self.file = open(path, "a")
         global_step = resumed.get("global_step", 0)
         self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
@@ -1995,11 +1996,12 @@ def parse_args(argv: list[str]) -> Args:
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
-    if given.resume and (given.evaluate or given.checkpoint):
+    resumes = given.resume is not None
+    if resumes and (given.evaluate or given.checkpoint):
         fail("--resume continues a run: leave out --evaluate and --checkpoint")
-    if given.resume or given.checkpoint:
-        run = load_checkpoint(given.resume or given.checkpoint)["args"]
-        default = replace(default, **{k: run[k] for k in (run if given.resume else FIXED_FLAGS)})
+    if resumes or given.checkpoint is not None:
+        run = load_checkpoint(given.resume if resumes else given.checkpoint)["args"]
+        default = replace(default, **{k: run[k] for k in (run if resumes else FIXED_FLAGS)})
     args = parse_flags(argv, default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
@@ -2009,7 +2011,7 @@ def parse_args(argv: list[str]) -> Args:
         args.num_actors = max(1, min(cores, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
-    if args.resume:
+    if resumes:
         args.resume = str(find_checkpoint(args.resume))
         check_resume(args, load_checkpoint(args.resume))
     return args
@@ -2133,9 +2135,9 @@ def check(args: Args) -> None:
     check_simulation(args)
     check_observations(args)
     run_dir = find_run_dir(args)
-    if args.resume:
+    if args.resume and RANK == 0:
         lock_run(run_dir).release()
-    elif not args.evaluate and os.path.exists(run_dir / "metrics.jsonl"):
+    if not (args.resume or args.evaluate) and os.path.exists(run_dir / "metrics.jsonl"):
         fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
 
 
@@ -2169,6 +2171,9 @@ def check_simulation(args: Args) -> None:
         fail(f"--sim_backend {args.sim_backend} --render_backend {args.render_backend}: {error}")
 
 
+TO_RENDER = "CPU: apt install mesa-vulkan-drivers, 23.1 or newer; GPU: NVIDIA_DRIVER_CAPABILITIES=all in a container"
+
+
 def check_observations(args: Args) -> None:
     """Refuse images that nothing can render."""
     textures = args.obs_mode.split("+")
@@ -2183,14 +2188,7 @@ def check_observations(args: Args) -> None:
         fail("--render_backend none: images must be rendered; ppo.py learns from the state")
     on_gpu = args.sim_backend != "physx_cpu"
     if RENDER_DEVICE is None or (on_gpu and not RENDER_DEVICE.is_cuda()):
-        fail(f"there is no Vulkan device to render images: {how_to_render(on_gpu)}, and see examples/check_machine.py; "
-             "ppo.py learns from the state")  # fmt: skip
-
-
-def how_to_render(on_gpu: bool) -> str:
-    if on_gpu:
-        return "NVIDIA_DRIVER_CAPABILITIES=all in a container"
-    return "apt install mesa-vulkan-drivers, 23.1 or newer; Debian 12 has it in its backports"
+        fail(f"there is no Vulkan device to render images: {TO_RENDER}; ppo.py learns from the state")
 
 
 # ----- Stopping, main -------------------------------------------------------------------------------------------------

@@ -136,12 +136,23 @@ def test_defaults_by_backend(monkeypatch):
         patch.setattr(ppo, "LOCAL_RANK", 1)
         local = ppo.local_args(ppo.parse_args([]))
         assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process of torchrun has its own"
+    assert args.num_eval_envs >= args.num_eval_episodes, "one round of evaluation episodes"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
     assert ppo.choose_device(args) == torch.device("cuda:0")
     args = ppo.parse_args(["--sim_backend", "physx_cpu", "--no-cuda"])
     assert ppo.choose_device(args) == torch.device("cpu")
+
+
+def test_training_and_evaluation_set_the_device_of_the_simulation(monkeypatch):
+    """CUDA graphs are captured on torch's current device."""
+    devices = []
+    monkeypatch.setattr(torch.cuda, "set_device", devices.append)
+    assert ppo.start_processes(ppo.Args(sim_backend="physx_cuda:1"), None) == torch.device("cuda:1")
+    assert devices == [torch.device("cuda:1")]
+    for function in (ppo.train, ppo.evaluate_checkpoint):
+        assert "start_processes" in function.__code__.co_names
 
 
 def test_help_shows_every_flag_with_this_machines_defaults(tmp_path):

@@ -87,9 +87,8 @@ def test_independent_of_environments_and_actors(env_id, monkeypatch):
     """Nor does it matter what was played in the same scenes before, or whether the last round is full."""
     args = replace(ARGS, env_id=env_id, control_mode=TASKS[env_id])
     env = ppo.make_env(args, 1)
-    agent = make_agent(
-        box(env.observation_space.shape[-1]), box(env.action_space.shape[-1]), replace(args, norm_obs=False)
-    )
+    action_space = env.get_wrapper_attr("single_action_space")
+    agent = make_agent(box(env.observation_space.shape[-1]), action_space, replace(args, norm_obs=False))
     env.close()
     agent.actor_mean[-1].weight.data *= 3
     agent.get_action = by_row(agent.get_action)

@@ -86,12 +86,12 @@ def test_compiled_is_near(train, script, monkeypatch):
     """In every minibatch; the noise of actions comes from another generator then."""
     update, compared = script.update_minibatch, []
 
-    def compare(agent, optimizer, args, obs, actions, *others):
+    def compare(agent, optimizer, args, obs, actions, **others):
         for x, y in zip(
             agent.get_action_and_value(obs, actions), type(agent).get_action_and_value(agent, obs, actions)
         ):
             compared.append(torch.testing.assert_close(x, y, rtol=1e-4, atol=1e-4))
-        return update(agent, optimizer, args, obs, actions, *others)
+        return update(agent, optimizer, args, obs=obs, actions=actions, **others)
 
     monkeypatch.setattr(script, "update_minibatch", compare)
     rows, *_ = train(total_timesteps=640, compile=True, cudagraphs=False)
