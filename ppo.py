@@ -1850,8 +1850,9 @@ def parse_flags(argv: list[str], default: Args) -> Args:
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
+            about = __doc__.splitlines()[0] + " The defaults are those of this machine."
             config = (tyro.conf.OmitArgPrefixes,)
-            parsed = tyro.cli(Groups, args=argv, default=Groups(**values), config=config, description=__doc__)
+            parsed = tyro.cli(Groups, args=argv, default=Groups(**values), config=config, description=about)
     except SystemExit as error:
         if error.code == 0:  # --help
             raise
