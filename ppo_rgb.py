@@ -1519,8 +1519,8 @@ class Actor:
                 self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, args, self.act)
 
-        floats = [x.flatten(2) if x.ndim > 2 else x[..., None] for x in self.storage.values() if x.is_floating_point()]
-        is_broken = ~torch.cat(floats, dim=2).isfinite().all(2).all(0)
+        shape, floats = self.storage["rewards"].shape, [x for x in self.storage.values() if x.is_floating_point()]
+        is_broken = ~torch.stack([x.isfinite().reshape(*shape, -1).all(2).all(0) for x in floats]).all(0)
         if not is_broken.any():
             return sums, None
         broken = is_broken.nonzero().flatten()
@@ -1795,7 +1795,7 @@ class Logger:
 
     def memory(self) -> dict:
         """In MiB: of this process, of its actors, and of the whole GPU."""
-        children = sum(child.memory_info().rss for child in psutil.Process().children())
+        children = sum(psutil.Process(child.pid).memory_info().rss for child in mp.active_children())
         memory = dict(memory_mb=psutil.Process().memory_info().rss / 2**20, actors_memory_mb=children / 2**20)
         if torch.cuda.is_initialized():
             free, total = torch.cuda.mem_get_info()

@@ -1,6 +1,7 @@
 """Several processes, started by torchrun, train together as one would with all their environments."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -115,7 +116,7 @@ def test_stopped_resumed_and_killed(tmp_path):
     start = time.monotonic()
     output, _ = process.communicate(timeout=60)
     assert time.monotonic() - start < 20
-    assert process.returncode != 0 and "Connection closed by peer" in output, output
+    assert process.returncode != 0 and re.search("Connection (closed|reset) by peer", output), output
     steps = [row["global_step"] for row in read_metrics(folder) if row["kind"] == "train"]
     assert steps == list(range(320, steps[-1] + 1, 320)), "no row twice, none missing"
     assert ppo.load_checkpoint(folder / "last.pt")["global_step"] >= steps[-1] - 320
