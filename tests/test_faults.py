@@ -610,9 +610,9 @@ def test_kill_at_random_moments(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_iterations, flags", [(400, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
+@pytest.mark.parametrize("num_iterations, flags", [(1000, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
 def test_memory_is_flat(tmp_path, num_iterations, flags):
-    """Over 400 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
+    """Over 1,000 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
     flags = (*flags, "--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
              "--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 2,
              "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-capture_video", "--no-cuda",
