@@ -54,7 +54,6 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, make_dataclass, replace
 from functools import partialmethod
-from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
@@ -589,10 +588,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     However the run ends, `closing` then writes last.pt, closes the files and ends the actors."""
     # --- environments, agent, optimizer ---
     stop_signals = closing.enter_context(StopSignals())
-    device = start_processes(args, closing)
+    device, run_dir = start_processes(args, closing)
     args = gather(args)[0]  # all processes need the same; defaults depend on the machine
     local = local_args(args)  # this process's part of the environments
-    run_dir = find_run_dir(args) if RANK == 0 else Path(tempfile.mkdtemp())  # only the first process writes the run
     resumed = load_checkpoint(args.resume) if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     torch.set_num_threads(1)  # idle threads would spin on cores that the simulation needs
@@ -600,7 +598,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     seed_all(args.seed)  # some tasks draw random numbers while they are built
     actors = closing.enter_context(contextlib.closing(Actors(local, run_dir / "videos")))
     envs = actors.local.envs
-    num_eval_episodes, max_eval_steps, rebuild_freq = plan_evaluation(actors.local.eval_envs, local)
+    num_eval_episodes, max_eval_steps = evaluation_size(actors.local.eval_envs, local)
     # PhysX remembers contacts of earlier episodes, and a batch keeps the objects that it was built with
     rebuilds = args.sim_backend == "physx_cpu" and (args.exact_resume or varies_objects(args.env_id))
 
@@ -625,12 +623,11 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     if envs.device.type != device.type:
         acting_agent = copy.deepcopy(agent).to(envs.device)
         learner_storage = {name: x.to(device) for name, x in storage.items()}
-    act = acting_agent.get_action_and_value
-    if args.compile:
-        act = torch.compile(act, dynamic=False)
-    actors.connect(acting_agent, storage, CudaGraph(act, args, envs.device))
+    actors.connect(acting_agent, storage)
     if args.compile:  # only now: a compiled function cannot be sent to other actors
-        agent.get_action_and_value = torch.compile(agent.get_action_and_value, dynamic=False)
+        for network in {agent, acting_agent}:  # on one device they are the same
+            network.get_action_and_value = torch.compile(network.get_action_and_value, dynamic=False)
+    actors.local.act = CudaGraph(acting_agent.get_action_and_value, args, envs.device)
     obs_names = [*envs.single_observation_space]
     batch = {name: learner_storage[name].flatten(0, 1) for name in (*obs_names, "actions", "logprobs", "values")}
     batch |= {name: torch.zeros(local.batch_size, device=device) for name in ("advantages", "returns")}
@@ -671,7 +668,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         is_due = args.eval_freq and iteration % args.eval_freq == 0
         if finished or (iteration == 0 or is_due) and not stopped_by:
             seed = args.eval_seed + RANK * num_eval_episodes
-            episodes = join(actors.call("evaluate", num_eval_episodes, seed, max_eval_steps, rebuild_freq))
+            episodes = join(actors.call("evaluate", num_eval_episodes, seed, max_eval_steps))
             episodes = join(gather(episodes))
             metrics = {key: values.mean().item() for key, values in episodes.items()}
             logger.log("eval", global_step, metrics | {"num_episodes": len(episodes["return"])})
@@ -695,13 +692,11 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         rollout_time = time.perf_counter() - start
 
         # --- advantages ---
-        rewards, values, next_values, dones = itemgetter("rewards", "values", "next_values", "dones")(learner_storage)
-        advantages, returns = compute_gae(
-            rewards, values, next_values, dones, args.gamma, args.gae_lambda, args.finite_horizon_gae
-        )
+        gae_inputs = [learner_storage[name] for name in ("rewards", "values", "next_values", "dones")]
+        advantages, returns = compute_gae(*gae_inputs, args.gamma, args.gae_lambda, args.finite_horizon_gae)
         batch["advantages"].copy_(advantages.flatten())
         batch["returns"].copy_(returns.flatten())
-        explained_variance = average(1 - (returns - values).var() / returns.var().clamp(min=1e-8))
+        explained_variance = average(1 - advantages.var() / returns.var().clamp(min=1e-8))
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
         torch.set_num_threads(num_update_threads())
@@ -709,9 +704,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
             for group in optimizer.param_groups:
                 if not group["adapts"]:  # fill a tensor: Python numbers are frozen in a CUDA graph
                     group["lr"].fill_(group["initial_lr"] * (1 - iteration / args.num_iterations))
-        problems = sum(gather([problem for _, problem in results if problem]), [])  # in any process
+        problems = sum(gather([problem for _, problem in results if problem]), [])  # of all processes
         update_metrics = []
-        for _ in range(0 if problems else args.update_epochs):  # numbers must be finite
+        for _ in range(0 if problems else args.update_epochs):  # learn from finite numbers only
             torch.randperm(local.batch_size, out=permutation)
             update_metrics.append(run_update_epoch().clone())
             last_kl = update_metrics[-1][-1, UPDATE_METRICS.index("approx_kl")]
@@ -849,16 +844,15 @@ def interval(values: torch.Tensor, is_rate: bool) -> tuple[float, float]:
 
 def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
     """--evaluate: play the episodes, print, film and write the results."""
-    folder = find_run_dir(args)
     torch.set_num_threads(1)
-    start_processes(args, closing)
+    _, folder = start_processes(args, closing)
     actors = closing.enter_context(contextlib.closing(Actors(args, folder / "test_videos")))
     envs = actors.local.eval_envs
     agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(envs.device)
     load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint)
     actors.connect(agent)
-    num_episodes, num_steps, rebuild_freq = plan_evaluation(envs, args)
-    episodes = join(actors.call("evaluate", num_episodes, args.eval_seed, num_steps, rebuild_freq))
+    num_episodes, num_steps = evaluation_size(envs, args)
+    episodes = join(actors.call("evaluate", num_episodes, args.eval_seed, num_steps))
     film = closing.enter_context(contextlib.closing(Film(args, folder)))
     if args.capture_video:
         for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs):
@@ -890,7 +884,7 @@ class Film:
         """Write <folder>/<name>.mp4, frame by frame. A film that cannot be written does not end the run."""
         if self.envs is None:
             self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
-        path, rebuild_freq = self.folder / f"{name}.mp4", plan_evaluation(self.envs, self.args)[2]
+        path, rebuild_freq = self.folder / f"{name}.mp4", evaluation_rebuild_freq(self.args)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with imageio.get_writer(path, fps=self.envs.base_env.control_freq) as video:
@@ -932,14 +926,15 @@ class ImageObservations(FlattenRGBDObservationWrapper):
         textures = args.obs_mode.split("+")
         self.others = [k for k in textures if k not in ("rgb", "depth")]
         self.num_frames, self.frames, self.latest = args.frame_stack, {}, {}
-        if not env.unwrapped._init_raw_obs["sensor_data"]:
+        cameras = env.unwrapped._init_raw_obs["sensor_data"].values()
+        if not cameras:
             raise RunError("neither the task nor its robot has a camera; ppo.py learns from the state")
+        if len({x.shape[1:3] for camera in cameras for x in camera.values()}) > 1:
+            raise RunError("the sizes of the cameras differ: give --camera_width and --camera_height")
         super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
 
     def observation(self, observation: dict, new_episodes=None) -> dict:
         cameras = observation["sensor_data"].values()
-        if len({x.shape[1:3] for camera in cameras for x in camera.values()}) > 1:
-            raise RunError("the sizes of the cameras differ: give --camera_width and --camera_height")
         latest = super().observation(observation)
         latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
         if "segmentation" in latest:
@@ -1038,17 +1033,21 @@ def make_envs(
     )
 
 
-def plan_evaluation(envs, args: Args) -> tuple[int, int, int]:
-    """Number of episodes, of steps in each, and after how many rounds of episodes new scenes are built (0: never)."""
+def evaluation_size(envs, args: Args) -> tuple[int, int]:
+    """Number of evaluation episodes, and of steps in each."""
     limit = find_max_episode_steps_value(envs)
     num_episodes, num_steps = args.num_eval_episodes, limit or args.num_eval_steps or 1000
     if limit and args.num_eval_steps:
         num_episodes = args.num_eval_envs * max(1, args.num_eval_steps // limit)
-    rebuild_freq = args.eval_reconfiguration_freq
-    if rebuild_freq is None:
-        is_exact = args.exact_resume and args.sim_backend == "physx_cpu"
-        rebuild_freq = 1 if varies_objects(args.env_id) or is_exact else 0
-    return num_episodes, num_steps, rebuild_freq
+    return num_episodes, num_steps
+
+
+def evaluation_rebuild_freq(args: Args) -> int:
+    """After how many rounds of episodes an evaluation builds new scenes (0: never)."""
+    if args.eval_reconfiguration_freq is not None:
+        return args.eval_reconfiguration_freq
+    is_exact = args.exact_resume and args.sim_backend == "physx_cpu"
+    return 1 if varies_objects(args.env_id) or is_exact else 0
 
 
 def can_reset_some(envs: ManiSkillVectorEnv) -> bool:
@@ -1528,11 +1527,13 @@ class Actor:
         self.obs, _ = self.envs.reset(options=dict(env_idx=broken) if can_choose else None)
         return sums, f"non-finite observation or reward in environments {(broken + self.env_idx.start).tolist()}"
 
-    def evaluate(self, num_episodes: int, seed: int, *arguments) -> dict[str, torch.Tensor]:
-        """This actor's part of the episodes from `seed` on; further arguments as those of `evaluate`."""
+    def evaluate(self, num_episodes: int, seed: int, num_steps: int) -> dict[str, torch.Tensor]:
+        """This actor's part of the episodes from `seed` on."""
         episodes = part(num_episodes, self.index, self.args.num_actors)
-        first_seed = seed + episodes.start
-        return evaluate(self.agent, self.eval_envs, len(episodes), first_seed, *arguments, self.separately)
+        first_seed, rebuild_freq = seed + episodes.start, evaluation_rebuild_freq(self.args)
+        return evaluate(
+            self.agent, self.eval_envs, len(episodes), first_seed, num_steps, rebuild_freq, self.separately
+        )
 
     def close(self) -> None:
         for envs in (self.envs, self.eval_envs):
@@ -1579,7 +1580,7 @@ class Actors:
         except BrokenProcessPool:
             raise RunError("the process of an actor died (killed? out of memory?)") from None
 
-    def connect(self, agent, storage: Optional[dict] = None, act=None) -> None:
+    def connect(self, agent, storage: Optional[dict] = None) -> None:
         """Share the agent and the storage with all actors: the tensors themselves, not copies."""
         if self.pools:
             tensors = [*agent.state_dict().values(), *(storage or {}).values()]
@@ -1588,7 +1589,6 @@ class Actors:
                 x.share_memory_()
         self.call("connect", agent, storage)
         self.built = []
-        self.local.act = act
 
     def close(self) -> None:
         self.call("close")
@@ -1677,13 +1677,11 @@ class Checkpoints:
         if self.args.save_freq and iteration > 0 and iteration % self.args.save_freq == 0:
             self.write(f"iteration_{iteration}.pt")
 
-    def update_best(self, score: list[float]) -> bool:
+    def update_best(self, score: list[float]) -> None:
         """Write best.pt if this score, success rate first, is the best so far."""
-        is_best = score > self.best_score and all(map(math.isfinite, score))
-        if is_best:
+        if score > self.best_score and all(map(math.isfinite, score)):
             self.best_score = self.contents["best_score"] = score
             self.write("best.pt")
-        return is_best
 
     def write(self, name: str) -> None:
         if self.args.save_model:
@@ -1780,13 +1778,13 @@ class Logger:
         if self.wandb_run:
             self.wandb_run.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
         names = {"success_once": "success", "return": "return", "episode_len": "length"}
-        summary = ", ".join(f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics)
+        summary = [f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics]
         if kind == "eval":
-            self.print(f"step {global_step:>9,}  evaluation: {summary}")
+            self.print(f"step {global_step:>9,}  evaluation: {', '.join(summary)}")
             if global_step > 0:
                 plot_learning_curve(self.run_dir)
             return
-        status = f"{metrics['sps']:,.0f} steps/s, {summary}"
+        status = ", ".join([f"{metrics['sps']:,.0f} steps/s", *summary])
         self.bar.set_postfix_str(status, refresh=False)
         self.bar.update(global_step - self.bar.n)
         if self.bar.disable and time.monotonic() - self.last_line > 10:  # no terminal
@@ -1896,8 +1894,8 @@ class CudaGraph:
         self.graph = self.function = None  # NCCL waits for graphs that contain its operations
 
 
-def start_processes(args: Args, closing: contextlib.ExitStack) -> torch.device:
-    """Connect the processes that torchrun started; returns the device that this one learns on."""
+def start_processes(args: Args, closing: contextlib.ExitStack) -> tuple[torch.device, Path]:
+    """Connect the processes that torchrun started; returns the device and the folder of this one."""
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = choose_device(local_args(args))
     if device.type == "cuda":
@@ -1905,7 +1903,9 @@ def start_processes(args: Args, closing: contextlib.ExitStack) -> torch.device:
     if WORLD_SIZE > 1:
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
         closing.callback(dist.destroy_process_group)
-    return device
+    if RANK > 0:  # only the first process writes the run
+        return device, Path(closing.enter_context(tempfile.TemporaryDirectory()))
+    return device, find_run_dir(args)
 
 
 def local_args(args: Args) -> Args:
@@ -1999,8 +1999,10 @@ def parse_args(argv: list[str]) -> Args:
     resumes = given.resume is not None
     if resumes and (given.evaluate or given.checkpoint):
         fail("--resume continues a run: leave out --evaluate and --checkpoint")
-    if resumes or given.checkpoint is not None:
-        run = load_checkpoint(given.resume if resumes else given.checkpoint)["args"]
+    path = given.resume if resumes else given.checkpoint
+    if path is not None:
+        checkpoint = load_checkpoint(path)
+        run = checkpoint["args"]
         default = replace(default, **{k: run[k] for k in (run if resumes else FIXED_FLAGS)})
     args = parse_flags(argv, default)
     args.sim_backend = choose_backend(args)
@@ -2012,8 +2014,10 @@ def parse_args(argv: list[str]) -> Args:
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     if resumes:
-        args.resume = str(find_checkpoint(args.resume))
-        check_resume(args, load_checkpoint(args.resume))
+        args.resume = str(find_checkpoint(path))
+        check_resume(args, checkpoint)
+    elif path is not None:
+        args.checkpoint = str(find_checkpoint(path))
     return args
 
 

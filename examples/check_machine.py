@@ -15,7 +15,8 @@ import sys
 from pathlib import Path
 from typing import Optional
 
-PACKAGES = ("mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil", "imageio")
+PACKAGES = ("mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil")
+PACKAGES += ("imageio", "filelock")
 ROOT = Path(__file__).resolve().parent.parent  # ppo.py lies here
 
 VULKAN = """
@@ -137,7 +138,7 @@ def main() -> None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     quota = read("/sys/fs/cgroup/cpu.max").split()
     limited = len(quota) == 2 and quota[0] != "max" and int(quota[0]) / int(quota[1])
-    row(None, "cores", f"{cores}" + (f", of which a quota allows {limited:.1f}" if limited else ""))
+    row(None, "cores", f"{cores}" + (f", and a quota allows {limited:.1f} of them" if limited else ""))
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

@@ -79,6 +79,12 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
     )
 
 
+def test_a_run_folder_stands_for_its_last_checkpoint(trained):
+    """Results of --evaluate go into that folder."""
+    args = ppo.parse_args(["--evaluate", "--checkpoint", str(trained[0])])
+    assert args.checkpoint == str(trained[0] / "last.pt") and ppo.find_run_dir(args) == trained[0]
+
+
 def test_wilson_interval():
     """Reference values of the score interval, to three digits (Newcombe 1998, table I: 81/263, 15/148, 0/20, 1/29)."""
     for successes, n, low, high in (
@@ -149,7 +155,8 @@ def test_training_and_evaluation_set_the_device_of_the_simulation(monkeypatch):
     """CUDA graphs are captured on torch's current device."""
     devices = []
     monkeypatch.setattr(torch.cuda, "set_device", devices.append)
-    assert ppo.start_processes(ppo.Args(sim_backend="physx_cuda:1"), None) == torch.device("cuda:1")
+    device, _ = ppo.start_processes(ppo.Args(sim_backend="physx_cuda:1", exp_name="x"), None)
+    assert device == torch.device("cuda:1")
     assert devices == [torch.device("cuda:1")]
     for function in (ppo.train, ppo.evaluate_checkpoint):
         assert "start_processes" in function.__code__.co_names

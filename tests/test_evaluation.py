@@ -40,9 +40,9 @@ def evaluate_with(args, agent, monkeypatch, again=False):
         actor = ppo.Actor(args, index)
         actor.connect(agent)
         if again:
-            actor.evaluate(EPISODES, SEED, STEPS, 0)
+            actor.evaluate(EPISODES, SEED, STEPS)
         monkeypatch.setattr(ppo, "start_episodes", spy)
-        parts.append(actor.evaluate(EPISODES, SEED, STEPS, 0))
+        parts.append(actor.evaluate(EPISODES, SEED, STEPS))
         monkeypatch.undo()
         actor.close()
         first_obs.append(torch.cat(of_actor)[: len(parts[-1]["return"])])
@@ -183,7 +183,7 @@ def test_each_actor_has_its_part_of_the_episodes(num_episodes, monkeypatch):
         actor = ppo.Actor(args, index)
         actor.connect(make_agent(box(4), Reach(1).single_action_space, SMALL))
         wanted += len(ppo.part(num_episodes, index, 3))
-        parts.append(actor.evaluate(num_episodes, 100, 3, 0))
+        parts.append(actor.evaluate(num_episodes, 100, 3))
     assert seeds == [*range(100, 100 + num_episodes)]
     assert len(ppo.join(parts)["return"]) == num_episodes
     assert all(math.isfinite(x) for x in ppo.join(parts)["return"])

@@ -422,7 +422,7 @@ def test_evaluation_builds_the_objects_of_its_seeds():
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
     found, step = [], envs.step
     envs.step = lambda action: found.extend(envs.base_env.peg_half_sizes.tolist()) or step(action)
-    ppo.evaluate(agent, envs, 4, 7, 1, ppo.plan_evaluation(envs, args)[2], separately=True)
+    ppo.evaluate(agent, envs, 4, 7, 1, ppo.evaluation_rebuild_freq(args), separately=True)
     single = gym.make(args.env_id, num_envs=1, sim_backend="physx_cpu", render_backend="none", obs_mode="state")
     wanted = []
     for seed in range(7, 11):
