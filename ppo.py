@@ -1350,9 +1350,7 @@ class Actor:
         """This actor's part of the episodes from `seed` on."""
         episodes = part(num_episodes, self.index, self.args.num_actors)
         first_seed, rebuild_freq = seed + episodes.start, evaluation_rebuild_freq(self.args)
-        return evaluate(
-            self.agent, self.eval_envs, len(episodes), first_seed, num_steps, rebuild_freq, self.separately
-        )
+        return evaluate(self.agent, self.eval_envs, len(episodes), first_seed, num_steps, rebuild_freq, self.separately)
 
     def close(self) -> None:
         for envs in (self.envs, self.eval_envs):

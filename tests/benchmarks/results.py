@@ -1,0 +1,228 @@
+"""What PPO reaches on ManiSkill's tasks: trains each CPU recipe of examples/recipes.sh with several seeds, evaluates
+best.pt and last.pt on 256 other episodes, and appends a row a run to results.jsonl.
+
+    python tests/benchmarks/results.py                                    # all that is missing; takes days
+    python tests/benchmarks/results.py --recipes push_cube_cpu --seeds 1 2 3 4 5
+    python tests/benchmarks/results.py --recipes push_cube_cpu --flags "--no-partial_reset"     # rows of their own
+    python tests/benchmarks/results.py --table              # writes the table in README.md here, and results.png
+
+Stop it at any time: it skips the rows that are there, and resumes a run that was interrupted. To repeat one row:
+`bash examples/recipes.sh <recipe> --seed <seed> <flags>`, then `--evaluate` with the flags of `EVALUATION`.
+"""
+
+import argparse
+import json
+import os
+import platform
+import re
+import shlex
+import statistics
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = Path(__file__).resolve().parent
+EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256", "--no-cuda", "--no-capture_video")
+
+
+TABLE_STARTS, TABLE_ENDS = "<!-- written by results.py -->", "<!-- end -->"
+
+
+def find_recipes() -> list[str]:
+    return re.findall(r"^(\w+_cpu)\(\)", (ROOT / "examples/recipes.sh").read_text(), re.MULTILINE)
+
+
+def read_rows(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def find_commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    return subprocess.run(command, cwd=FOLDER, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def describe_processor() -> str:
+    """The model of the processor, where Linux says it."""
+    try:
+        cpuinfo = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        cpuinfo = ""
+    names = re.findall(r"model name\s*: (.*)", cpuinfo)
+    return names[0] if names else platform.machine()
+
+
+def run_script(*command: str) -> None:
+    """The recipes call `python`: let that be this interpreter."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ, "PATH": path}, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
+
+
+def train(recipe: str, seed: int, flags: list[str], script: str) -> Path:
+    """The folder of the finished run."""
+    name = "_".join(["results", recipe, str(seed), *(flag.strip("-") for flag in flags)])
+    run_dir = ROOT / "runs" / name
+    if (run_dir / "last.pt").exists():
+        run_script("python", script, "--resume", str(run_dir))
+    else:
+        own = ["--seed", str(seed), "--exp_name", name, "--no-capture_video"]
+        run_script("bash", "examples/recipes.sh", recipe, *own, *flags)
+    return run_dir
+
+
+def evaluate(run_dir: Path, script: str, checkpoint: str) -> dict:
+    """The metrics of 256 episodes: mean, and ends of the 95% interval."""
+    run_script("python", script, "--checkpoint", str(run_dir / checkpoint), *EVALUATION)
+    found = json.loads((run_dir / "eval.json").read_text())
+    names = [k for k in ("success_once", "success_at_end", "return", "episode_len") if k in found]
+    return {k: [round(x, 4) for x in (found[k], *found.get(f"{k}_interval", ()))] for k in names}
+
+
+def learning_curve(run_dir: Path) -> list[tuple[int, float, float]]:
+    """Of each evaluation: environment steps, seconds of training, and the success rate or else the return."""
+    seconds, points = 0.0, []
+    for row in map(json.loads, (run_dir / "metrics.jsonl").read_text().splitlines()):
+        if row["kind"] == "train":
+            seconds += row["rollout_time"] + row["update_time"]
+        else:
+            points.append((row["global_step"], round(seconds, 1), round(row.get("success_once", row["return"]), 4)))
+    return points
+
+
+def make_row(recipe: str, seed: int, flags: list[str]) -> dict:
+    script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
+    run_dir = train(recipe, seed, flags, script)
+    about = json.loads((run_dir / "args.json").read_text())
+    curve = learning_curve(run_dir)
+    highest = max(value for _, _, value in curve)
+    steps, seconds, _ = next(point for point in curve if point[2] >= 0.9 * highest)
+    return dict(
+        recipe=recipe,
+        task=about["args"]["env_id"],
+        further_flags=shlex.join(flags),
+        seed=seed,
+        flags=about["args"],
+        commit=find_commit(),
+        hardware=f"{about['device']}, {describe_processor()}",
+        versions=about["versions"],
+        steps=curve[-1][0],
+        training_seconds=curve[-1][1],
+        best=evaluate(run_dir, script, "best.pt"),
+        last=evaluate(run_dir, script, "last.pt"),
+        steps_to_nine_tenths_of_the_best=steps,
+        seconds_to_nine_tenths_of_the_best=seconds,
+        curve=curve,
+    )
+
+
+def group(rows: list[dict]) -> dict[str, list[dict]]:
+    """The runs of each recipe, by seed; recipes in the order of examples/recipes.sh."""
+    recipes, groups = find_recipes(), defaultdict(list)
+    for row in sorted(rows, key=lambda row: (recipes.index(row["recipe"]), row["further_flags"], row["seed"])):
+        groups[f"{row['recipe']} {row['further_flags']}".strip()].append(row)
+    return groups
+
+
+def is_solved(row: dict) -> bool:
+    """Nine of ten episodes succeed; without success, the return is 0.8 of its maximum: 1 at every step."""
+    best = row["best"]
+    if "success_once" in best:
+        return best["success_once"][0] >= 0.9
+    return best["return"][0] >= 0.8 * best["episode_len"][0]
+
+
+def write_table(rows: list[dict], path: Path) -> None:
+    """Replace the table in this file."""
+    lines = [
+        "| recipe | task | steps | minutes | success once | success at end | return | last policy | 90% after |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    solved = 0
+    for name, runs in group(rows).items():
+
+        def each_seed(metric: str, policy: str = "best", runs=runs) -> str:
+            digits = 0 if metric == "return" and runs[0][policy][metric][0] >= 100 else 2
+            return ", ".join(f"{run[policy][metric][0]:,.{digits}f}" for run in runs if metric in run[policy])
+
+        main_metric = "success_once" if "success_once" in runs[0]["best"] else "return"
+        minutes = [run["training_seconds"] / 60 for run in runs]
+        to_best = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
+        is_done = all(map(is_solved, runs))
+        solved += is_done
+        cells = [
+            f"{'**' if is_done else ''}`{name}`{'**' if is_done else ''}",
+            runs[0]["task"].rpartition(":")[2],
+            f"{max(run['steps'] for run in runs):,}",
+            f"{min(minutes):.0f} to {max(minutes):.0f}",
+            each_seed("success_once"),
+            each_seed("success_at_end"),
+            each_seed("return"),
+            each_seed(main_metric, "last"),
+            f"{statistics.median(to_best):,.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    text = path.read_text()
+    before, after = text.partition(TABLE_STARTS)[0], text.partition(TABLE_ENDS)[2]
+    path.write_text("\n".join([before + TABLE_STARTS, *lines, TABLE_ENDS]) + after)
+    print(f"{path}: {len(group(rows))} recipes, {solved} solved in every seed")
+
+
+def draw_curves(rows: list[dict], path: Path) -> None:
+    """A picture a recipe: the mean of the seeds, and their range."""
+    groups = group(rows)
+    columns = min(5, len(groups))
+    figure = Figure(figsize=(2.6 * columns, 2.1 * -(-len(groups) // columns)), layout="constrained")
+    axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).flatten()
+    for axis in axes[len(groups) :]:
+        axis.axis("off")
+    for axis, (name, runs) in zip(axes, groups.items()):
+        points = defaultdict(list)
+        for run in runs:
+            for steps, _, value in run["curve"]:
+                points[steps / 1000].append(value)
+        x = [steps for steps, values in points.items() if len(values) == len(runs)]  # where all seeds were evaluated
+        values = [points[steps] for steps in x]
+        axis.fill_between(x, [min(v) for v in values], [max(v) for v in values], alpha=0.3)
+        axis.plot(x, [statistics.mean(v) for v in values])
+        axis.set_title(name.replace("_cpu", ""), fontsize=8)
+        axis.tick_params(labelsize=7)
+        is_rate = "success_once" in runs[0]["best"]
+        axis.set_ylim(0, 1.03 if is_rate else None)
+        axis.set_ylabel("success rate" if is_rate else "return", fontsize=7)
+        axis.grid(alpha=0.3)
+    figure.supxlabel("thousand environment steps", fontsize=8)
+    figure.savefig(path, dpi=100)
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recipes", nargs="+", choices=find_recipes(), default=find_recipes())
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--flags", type=shlex.split, default=[], help="further flags of the script")
+    parser.add_argument("--out", type=Path, default=FOLDER / "results.jsonl")
+    parser.add_argument("--table", action="store_true", help="run nothing: write the table and the picture")
+    options = parser.parse_args(argv)
+    rows = read_rows(options.out)
+    if options.table:
+        write_table(rows, options.out.with_name("README.md"))
+        draw_curves(rows, options.out.with_suffix(".png"))
+        return
+    further_flags = shlex.join(options.flags)
+    done = {(row["recipe"], row["seed"]) for row in rows if row["further_flags"] == further_flags}
+    wanted = [(recipe, seed) for seed in options.seeds for recipe in options.recipes]
+    missing = [run for run in wanted if run not in done]
+    for recipe, seed in (bar := tqdm(missing, unit="run")):
+        bar.set_postfix_str(f"{recipe}, seed {seed}")
+        row = make_row(recipe, seed, options.flags)
+        with open(options.out, "a") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

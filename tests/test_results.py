@@ -1,0 +1,89 @@
+"""tests/benchmarks/results.py: the table of what PPO reaches."""
+
+import json
+import shlex
+import shutil
+
+import pytest
+from benchmarks import results
+from conftest import ROOT, read_metrics
+
+FLAGS = "--total_timesteps 640 --num_envs 4 --num_steps 40 --eval_freq 2 --num_eval_episodes 2 --num_actors 1"
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project with the script and the recipes alone, so that runs go there; evaluations are short."""
+    (tmp_path / "examples").mkdir()
+    for name in ("ppo.py", "examples/recipes.sh"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    (tmp_path / "README.md").write_text(f"before\n{results.TABLE_STARTS}\nold\n{results.TABLE_ENDS}\nafter\n")
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    monkeypatch.setattr(results, "EVALUATION", [x.replace("256", "3") for x in results.EVALUATION])
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_row_of_the_table(project, capsys):
+    out = project / "results.jsonl"
+    command = ["--recipes", "push_cube_cpu", "--seeds", "2", "--out", str(out), "--flags", FLAGS]
+    results.main(command)
+    (row,) = map(json.loads, out.read_text().splitlines())
+    assert (row["recipe"], row["task"], row["seed"], row["steps"]) == ("push_cube_cpu", "PushCube-v1", 2, 640)
+    assert row["further_flags"] == shlex.join(shlex.split(FLAGS)) and row["flags"]["num_steps"] == 40
+    assert row["versions"].keys() >= {"torch", "mani-skill", "sapien"} and "CPU" in row["hardware"] and row["commit"]
+    for policy in ("best", "last"):
+        mean, low, high = row[policy]["success_once"]
+        assert 0 <= low <= mean <= high <= 1
+        assert row[policy]["return"][0] > 0 and row[policy]["episode_len"][0] == 50
+
+    (run_dir,) = (project / "runs").iterdir()
+    trained = [x["rollout_time"] + x["update_time"] for x in read_metrics(run_dir) if x["kind"] == "train"]
+    assert row["training_seconds"] == pytest.approx(sum(trained), abs=0.1)
+    assert [steps for steps, _, _ in row["curve"]] == [0, 320, 640]
+
+    results.main(command)  # the row is there
+    assert out.read_text().count("\n") == 1
+    modified = (run_dir / "last.pt").stat().st_mtime
+    assert results.train("push_cube_cpu", 2, shlex.split(FLAGS), "ppo.py") == run_dir  # so is the run
+    assert (run_dir / "last.pt").stat().st_mtime == modified
+
+    results.main([*command, "--table"])
+    assert "1 recipes, 0 solved" in capsys.readouterr().out
+    before, _, header, _, line, _, after = (project / "README.md").read_text().splitlines()
+    assert (before, after) == ("before", "after") and line.count("|") == header.count("|")
+    assert (project / "results.png").stat().st_size > 10_000
+
+
+def make_row(recipe, seed, success=None, reward=0.5, steps=3):
+    metrics = dict(episode_len=[1000.0])
+    metrics["return"] = [1000 * reward, 0.0, 1000.0]
+    if success is not None:
+        metrics |= dict(success_once=[success, 0.0, 1.0], success_at_end=[success / 2, 0.0, 1.0])
+    curve = [[100 * i, 60.0 * i, reward] for i in range(steps)]
+    return dict(
+        recipe=recipe, further_flags="", seed=seed, task="Task", steps=200, training_seconds=120.0, best=metrics,
+        last=metrics, steps_to_nine_tenths_of_the_best=100, curve=curve,
+    )  # fmt: skip
+
+
+def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
+    """By success where the task has it, else by the return."""
+    path = tmp_path / "README.md"
+    path.write_text(f"{results.TABLE_STARTS}\n{results.TABLE_ENDS}\n")
+    rows = [make_row("push_cube_cpu", seed, success) for seed, success in ((2, 0.95), (1, 0.9), (3, 0.91))]
+    rows += [make_row("pick_cube_cpu", seed, success) for seed, success in ((1, 0.95), (2, 0.89))]
+    rows += [make_row("cartpole_balance_cpu", 1, reward=0.81), make_row("hopper_stand_cpu", 1, reward=0.79)]
+    results.write_table(rows, path)
+    assert "4 recipes, 2 solved" in capsys.readouterr().out
+    bold = [line for line in path.read_text().splitlines() if "**" in line]
+    assert len(bold) == 2 and "`push_cube_cpu`" in bold[0] and "0.90, 0.95, 0.91" in bold[0] and "810" in bold[1]
+
+
+def test_the_table_names_recipes_that_exist():
+    """And holds each row once."""
+    rows = results.read_rows(results.FOLDER / "results.jsonl")
+    keys = [(row["recipe"], row["further_flags"], row["seed"]) for row in rows]
+    assert len(set(keys)) == len(keys) and {recipe for recipe, _, _ in keys} <= set(results.find_recipes())
+    for row in rows:
+        assert row["steps"] == row["curve"][-1][0] and row["curve"][0][0] == 0
