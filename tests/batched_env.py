@@ -6,7 +6,7 @@ import torch
 from gymnasium.vector.utils import batch_space
 
 import ppo_rgb
-from ppo import ManiSkillVectorEnv  # ppo before mani_skill, which it prepares for machines without Vulkan
+from ppo import ManiSkillVectorEnv  # ppo before mani_skill: it makes tasks build on machines without Vulkan
 
 
 class BatchedReach(gym.Env):
@@ -38,21 +38,21 @@ class BatchedReach(gym.Env):
         env_idx = (options or {}).get("env_idx", torch.arange(self.num_envs)).to(self.device)
         if seed is None:
             fresh = torch.rand(len(env_idx), 4, device=self.device)
-        else:  # one for each environment, whichever of them start
+        else:  # one seed for each environment, even if only some of them reset
             draws = [torch.rand(4, generator=torch.Generator().manual_seed(s)) for s in seed]
             fresh = torch.stack(draws).to(self.device)[env_idx]
         self.state[env_idx] = 2 * fresh - 1
         self.elapsed_steps[env_idx] = 0
         return self.observe(), self.info()[0]
 
-    def _set_main_rng(self, seeds):  # of the two generators that ManiSkill's tasks have, and this one has not
+    def _set_main_rng(self, seeds):  # ManiSkill's tasks have two random generators; this one has none
         pass
 
     def _set_episode_rng(self, seeds, env_idx):
         pass
 
     def step(self, actions):
-        assert (actions.abs() <= 1).all(), "actions come clipped to the action space"
+        assert (actions.abs() <= 1).all(), "actions must be clipped to the action space"
         self.state[:, :2] += 0.3 * actions
         self.elapsed_steps += 1
         info, distance = self.info()
@@ -61,14 +61,14 @@ class BatchedReach(gym.Env):
 
 
 class BatchedReachImages(BatchedReach):
-    """The same seen by two cameras, in ManiSkill's raw form: the goal on the images alone."""
+    """BatchedReach seen by two cameras, with observations in ManiSkill's raw form. Only the images show the goal."""
 
     size = 36
 
     def __init__(self, num_envs, device):
         super().__init__(num_envs, device)
         on_cpu = lambda tree: {k: on_cpu(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.cpu()
-        self.update_obs_space(on_cpu(self.observe()))  # as ManiSkill keeps its first observation
+        self.update_obs_space(on_cpu(self.observe()))  # ManiSkill keeps its first observation too
 
     def update_obs_space(self, obs):
         self._init_raw_obs = obs

@@ -1,6 +1,6 @@
 import os
 
-# several processes share the cores: threads that wait by spinning would take them from each other
+# several processes share the cores: threads must not spin while they wait
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import contextlib
@@ -26,7 +26,7 @@ NO_VULKAN = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexisten
 
 
 def run_script(*arguments, cwd, env=None, script=ROOT / "ppo.py", timeout=600):
-    """Run ppo.py as a user would; returns the finished process with its output as text."""
+    """Run ppo.py, or another script, as a user would; returns the finished process with its output as text."""
     return subprocess.run(
         [sys.executable, str(script), *map(str, arguments)],
         cwd=cwd,
@@ -40,7 +40,7 @@ def run_script(*arguments, cwd, env=None, script=ROOT / "ppo.py", timeout=600):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config):
-    """Two processes, where pytest-xdist is installed: tests/test_task.py must run without it."""
+    """Use two processes if pytest-xdist is installed. tests/test_task.py must also run without it."""
     is_worker = hasattr(config, "workerinput")
     if config.pluginmanager.hasplugin("xdist") and not is_worker and config.option.numprocesses is None:
         config.option.numprocesses, config.option.dist = 2, "worksteal"
@@ -51,7 +51,7 @@ def pytest_addoption(parser):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Which simulation the checks of tasks ran on."""
+    """Print which simulation the checks of tasks ran on."""
     for where, simulation in (("physx_cpu", "a batch on the CPU"), ("physx_cuda", "PhysX's GPU simulation")):
         reports = [
             sum(
@@ -70,7 +70,7 @@ def pytest_runtest_setup(item):
         pytest.skip("needs a CUDA GPU")
     if item.get_closest_marker("render"):
         if ppo.RENDER_DEVICE is None:
-            # CI installs software Vulkan: a renderer that is missing there is a defect, not a circumstance
+            # CI installs software Vulkan: if the renderer is missing there, the test fails
             (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a Vulkan device")
 
 
@@ -85,14 +85,14 @@ def in_tmp(tmp_path, monkeypatch):
     return tmp_path
 
 
-# the values for a GPU, small; of the task only the registration is looked at
+# the defaults for a GPU with small sizes; tests that replace make_envs use only the registration of env_id
 SMALL = ppo.Args(
     sim_backend="physx_cpu", num_envs=32, num_eval_envs=16, num_eval_episodes=24, num_actors=1, num_steps=10,
     total_timesteps=32 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False,
 )  # fmt: skip
 
 
-ACTIONS = gym.spaces.Box(-1, 1, (2,), np.float32)  # of the torch-native environments
+ACTIONS = gym.spaces.Box(-1, 1, (2,), np.float32)  # action space of the torch-native environments
 
 
 def box(size):
@@ -105,7 +105,7 @@ def read_metrics(folder):
 
 @pytest.fixture
 def script():
-    """The script that `train` and `in_update` work with; tests of the other one override it, and `small`."""
+    """The script that `train` and `in_update` use. Tests of ppo_rgb.py override this fixture and `small`."""
     return ppo
 
 
@@ -116,10 +116,10 @@ def small():
 
 @pytest.fixture
 def train(in_tmp, monkeypatch, device, script, small):
-    """Train in this process on the torch-native environments, with the flags given; the runs are called run1, run2, …
-    Returns the metrics, the last checkpoint and the exit code."""
+    """A function that trains in this process on the torch-native environments, with the given flags. Its runs are named
+    run1, run2, … It returns the metrics, the last checkpoint and the exit code."""
     monkeypatch.setattr(script, "make_envs", partial(batched_env.make_envs, device=device))
-    monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # which takes longer than these runs
+    monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # plotting takes longer than these runs
     count = 0
 
     def run(**flags):
@@ -158,7 +158,7 @@ def scalars(folder):
 
 
 def same_run(a, b):
-    """Weights, optimizer, metrics and TensorBoard of two run folders are equal, wall-clock fields aside."""
+    """Assert that two run folders have equal weights, optimizers, metrics and TensorBoard scalars, wall clock aside."""
     for name in ("last.pt", "best.pt"):
         x, y = ppo.load_checkpoint(a / name), ppo.load_checkpoint(b / name)
         assert same_weights(x, y) and x["global_step"] == y["global_step"]
@@ -171,7 +171,7 @@ def same_run(a, b):
 
 @pytest.fixture
 def in_update(monkeypatch, script):
-    """Do something in the middle of the update of one iteration, once; its result, if any, stands for the metrics."""
+    """A function that arranges for an action to run once, in the middle of the update of one iteration."""
 
     def arrange(iteration, action, per_iteration=8):
         update, calls = script.update_minibatch, []
@@ -196,7 +196,7 @@ def crash():
 
 
 def refused(arguments, capsys, script=ppo):
-    """The one line with which the script refuses these arguments; fails unless it refuses them as it should."""
+    """Run the script with bad arguments; returns its line of error. The script must exit with 2 and write nothing."""
     before = sorted(Path().rglob("*"))
     with pytest.raises(SystemExit) as exit:
         script.main([*map(str, arguments)])
@@ -211,13 +211,31 @@ def refused(arguments, capsys, script=ppo):
     return output.err
 
 
+@pytest.fixture
+def run_recipe(tmp_path, monkeypatch):
+    """A function that runs examples/recipes.sh with a stand-in for `python`. It returns the words of the command that
+    the recipe would have run, and what was printed as an error."""
+    stand_in = tmp_path / "bin/python"
+    stand_in.parent.mkdir()
+    stand_in.write_text('#!/bin/sh\nfor x in "$@"; do printf "%s\\0" "$x"; done\n')
+    stand_in.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{stand_in.parent}:{os.environ['PATH']}")
+
+    def run(*arguments):
+        command = ["bash", str(ROOT / "examples/recipes.sh"), *arguments]
+        process = subprocess.run(command, capture_output=True, text=True)
+        return process.stdout.split("\0")[:-1], process.stderr
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A short run with two actors on the CPU, made once: its folder, and what it printed."""
+    """A short run with two actors on the CPU, made once: its folder, its stdout and its stderr."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
     folder.mkdir(exist_ok=True)
-    with open(folder / "lock", "w") as lock:  # for the first of pytest's processes to make it
+    with open(folder / "lock", "w") as lock:  # only the first of pytest's processes makes the run
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "output.json").exists():
             shutil.copy(ROOT / "ppo.py", folder)  # a copied script must work on its own

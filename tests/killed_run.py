@@ -1,6 +1,7 @@
 """Train on the torch-native environments, once undisturbed and once killed twenty times at random moments.
 
-Forked children spare each attempt the imports; this process itself computes nothing, so that the fork is safe."""
+Each attempt runs in a forked child, so the imports happen only once. Forking is safe because this process itself
+computes nothing."""
 
 import contextlib
 import os
@@ -26,7 +27,7 @@ ARGS = dict(
 
 
 def attempt(**flags):
-    """A child that trains; its process id."""
+    """Train in a forked child; returns its process id."""
     pid = os.fork()
     if pid == 0:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -51,12 +52,12 @@ if __name__ == "__main__":
         rows = metrics.read_bytes().count(b"\n") if metrics.exists() else 0
         pid, goal = resume_or_start(), rows + random.randrange(10)
         deadline = time.monotonic() + 20
-        time.sleep(random.uniform(0.0, 0.2))  # while it starts, often
+        time.sleep(random.uniform(0.0, 0.2))  # often the run is still starting
         while metrics.exists() and metrics.read_bytes().count(b"\n") < goal and time.monotonic() < deadline:
             time.sleep(0.002)
-        time.sleep(random.uniform(0.0, 0.05))  # an iteration takes about so long
+        time.sleep(random.uniform(0.0, 0.05))  # an iteration takes about this long
         os.kill(pid, signal.SIGKILL)
-        assert os.waitpid(pid, 0)[1] == signal.SIGKILL, "the run ended before its twentieth death"
+        assert os.waitpid(pid, 0)[1] == signal.SIGKILL, "the run ended before the twentieth kill"
         if Path("runs/killed/last.pt").exists():
             progress.append(ppo.load_checkpoint("runs/killed/last.pt")["iteration"])  # readable at any instant
     assert os.waitpid(resume_or_start(), 0)[1] == 0

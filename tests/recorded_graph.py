@@ -1,8 +1,8 @@
 """A stand-in for CUDA graphs on the CPU.
 
-Like a CUDA graph it records, once, the operations that a function makes, and repeats them afterwards on the same
-memory, without the function: numbers that Python held at the recording are frozen, tensors are where they were. Like a
-capture it refuses what makes the host look at a number."""
+Like a CUDA graph, it records the operations of a function once. Later it repeats them on the same memory, without
+calling the function: Python numbers keep their recorded values, and tensors stay where they were. Like the capture of
+a CUDA graph, the recording refuses operations that make the host read a number."""
 
 import copy
 
@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 aten = torch.ops.aten
-LOOKS_OF_THE_HOST = {aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default,
+READS_BY_THE_HOST = {aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default,
                      aten.equal.default}  # fmt: skip
 
 
@@ -21,8 +21,8 @@ class Recording(TorchDispatchMode):
         self.tape = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        if func in LOOKS_OF_THE_HOST:
-            raise AssertionError(f"the host looks at a number: {func}")
+        if func in READS_BY_THE_HOST:
+            raise AssertionError(f"the host reads a number: {func}")
         result = func(*args, **(kwargs or {}))
         self.tape.append((func, args, kwargs or {}, result))
         return result
@@ -33,11 +33,11 @@ class Recording(TorchDispatchMode):
             after = func(*args, **kwargs)
             for old, new in zip(tree_leaves(before), tree_leaves(after), strict=True):
                 if isinstance(old, torch.Tensor) and old.untyped_storage()._cdata != new.untyped_storage()._cdata:
-                    old.detach().copy_(new)  # neither in place nor a view
+                    old.detach().copy_(new)  # the operation was neither in place nor a view
 
 
 class RecordedGraph:
-    """In place of `CudaGraph`: one call before the recording, which is a call too."""
+    """Replaces `CudaGraph`. The first call runs the function, the second runs and records it, later ones replay it."""
 
     def __init__(self, function, args, device):
         self.function, self.enabled, self.recording, self.num_calls = function, args.cudagraphs, Recording(), 0

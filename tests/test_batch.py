@@ -32,12 +32,12 @@ from sapien import physx
 
 ROOT = Path(__file__).parent.parent
 TOLERANCE = 1e-5
-NOISE = 1e-5  # on states that are brought together, for a batch to write them all: it leaves alone what is unchanged
+NOISE = 1e-5  # added to copied states, because a batch writes only numbers that have changed
 
 FAST = ["PickCube-v1", "PegInsertionSide-v1", "MS-HopperHop-v1", "MS-AntWalk-v1", "TwoRobotPickCube-v1"]
 FAST += ["TriFingerRotateCubeLevel4-v1", "DrawTriangle-v1", "examples.push_from_clutter:PushFromClutter-v1"]
 
-# Where a single environment and ManiSkill's code for batches differ by themselves, on a GPU as here.
+# Where ManiSkill's own code treats a batch and a single environment differently, on a GPU as well.
 TORSO = "a batch places the camera's mount before it fetches what the step did to the torso, a step late"
 DIFFERENT = {
     ("MS-AntWalk-v1", "state/actors/camera_mount"): TORSO,
@@ -50,7 +50,7 @@ DIFFERENT = {
     ("PullCubeTool-v1", "info/cube_distance"): "the mean over all environments",
     ("PullCubeTool-v1", "info/cube_progress"): "the mean over all environments",
 }
-# ManiSkill's own code for these cannot reset some of several environments.
+# For these tasks, ManiSkill's own code cannot reset some of several environments.
 WITHOUT_PARTIAL_RESETS = {
     "FMBAssembly1Easy-v1": "poses for all environments",
     "RotateSingleObjectInHandLevel1-v1": "poses for all environments",
@@ -64,13 +64,13 @@ WITHOUT_PARTIAL_RESETS = {
 def make(env_id, num_envs, **kwargs):
     kwargs = dict(obs_mode="state_dict", render_backend="none") | kwargs
     if "Draw" in env_id:
-        ppo.find_task(env_id).cls.MAX_DOTS = 20  # hundreds take ten seconds to build where there is Vulkan
+        ppo.find_task(env_id).cls.MAX_DOTS = 20  # with Vulkan, hundreds take ten seconds to build
     return gym.make(env_id, num_envs=num_envs, sim_backend="physx_cpu", **kwargs).unwrapped
 
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """For what is so small; pytest runs several processes."""
+    """Use one thread: the tensors are small, and pytest runs several processes."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -79,7 +79,7 @@ def one_thread():
 
 @pytest.fixture
 def build():
-    """`make`, for environments that are closed in the end."""
+    """`make`, but it closes the environments after the test."""
     envs = []
 
     def build(*args, **kwargs):
@@ -106,7 +106,7 @@ def select(tree, chosen):
 
 
 def row_of(value, row, old):
-    """Row `row` of what a batch holds, if `old`, what a single environment holds there, is of that form; else `old`."""
+    """Returns row `row` of a batch's value if it has the form of `old`, a single environment's value; else `old`."""
     if isinstance(value, Pose) and isinstance(old, Pose):
         return Pose.create(row_of(value.raw_pose, row, old.raw_pose))
     if isinstance(value, torch.Tensor) and isinstance(old, torch.Tensor) and value.ndim:
@@ -135,7 +135,7 @@ def state_of(env, row=0, state=None):
 
 
 def copy_episode(batch, single, row):
-    """What an episode is made of besides the state: the task's tensors, and those of the controllers."""
+    """Copy what an episode consists of in addition to the state: the tensors of the task and of the controllers."""
     for name, value in vars(batch).items():
         if name in vars(single) and name not in ("_last_obs", "_init_raw_obs", "_init_raw_state"):
             vars(single)[name] = row_of(value, row, vars(single)[name])
@@ -145,7 +145,7 @@ def copy_episode(batch, single, row):
 
 
 def bring_together(batch, single, row):
-    """Give the single environment the episode and the state of that row, the state slightly changed in both."""
+    """Copy the episode and the state of that row to the single environment, and add the same noise to both states."""
     copy_episode(batch, single, row)
     state = {k: v for k, v in batch.get_state_dict().items() if k != "controller"}
     for kind, tensors in state.items():
@@ -154,14 +154,14 @@ def bring_together(batch, single, row):
                 tensor += NOISE * torch.rand(tensor.shape)
     batch.set_state_dict(state)
     wanted, present = state_of(batch, row, state), state_of(single)
-    for kind, tensors in present.items():  # objects that are built for one environment have a name of their own there
+    for kind, tensors in present.items():  # objects that are built for each environment have other names in a batch
         pairs = zip(tensors.items(), wanted[kind].values(), strict=True)
         present[kind] = {name: new for (name, old), new in pairs if not torch.equal(new, old)}
     single.set_state_dict(present)
 
 
 def differences(env_id, batched, single, row, num_envs):
-    """Which of the tensors in two trees, those of a batch and of a single environment, are not equal."""
+    """Compare the tensors of a batch's row and of a single environment; returns the differences by name."""
     found = {}
     batched, single = [dict(item for k, v in x.items() for item in flat(v, k).items()) for x in (batched, single)]
     if batched.keys() != single.keys():
@@ -190,7 +190,7 @@ def sample(env, rng):
 
 
 def named(state):
-    """States of objects, in order: those of one environment of a batch may have other names."""
+    """Replace the names of objects by their order: a batch may use other names than a single environment."""
     return {kind: dict(enumerate(tensors.values())) for kind, tensors in state.items()}
 
 
@@ -213,7 +213,7 @@ def compare(env_id, num_envs=3, row=1, steps=10, every=5, **kwargs):
         for step in range(steps):
             if step % every == 0:
                 bring_together(batch, single, row)
-                if env_id not in WITHOUT_PARTIAL_RESETS:  # of the others, which must leave this one alone
+                if env_id not in WITHOUT_PARTIAL_RESETS:  # resetting the other rows must not change this one
                     others = [i for i in range(num_envs) if i != row]
                     batch.reset(options=dict(env_idx=torch.tensor(others)))
                     copy_episode(batch, single, row)  # ManiSkill resets the targets of all controllers
@@ -241,7 +241,7 @@ def compare(env_id, num_envs=3, row=1, steps=10, every=5, **kwargs):
 
 
 def compare_all(cases):
-    """Those of the cases (arguments of compare) that build here, and what is different in them."""
+    """Run `compare` on each case; returns the cases that can be built here, and the differences found in them."""
     built, found = [], {}
     for case, kwargs in cases:
         with contextlib.suppress(NotHere):
@@ -289,7 +289,7 @@ def test_every_controller_of_the_panda(build):
 @pytest.mark.slow
 @pytest.mark.parametrize("quarter", range(4))
 def test_every_robot(quarter, monkeypatch):
-    """Each controller of each robot that builds here, alone on the ground."""
+    """For each controller of each robot that builds here, alone on the ground, a batch equals single environments."""
     monkeypatch.setattr(sys, "stdin", open(os.devnull))
     cases = []
     for uid in sorted(REGISTERED_AGENTS)[quarter::4]:
@@ -307,12 +307,12 @@ def test_every_robot(quarter, monkeypatch):
 
 
 def physics(env, row):
-    """Every bit of the simulation of one environment."""
+    """Returns the whole state of the simulation of one environment, as bytes."""
     return env.scene.sub_scenes[row].physx_system.pack()
 
 
 def copy_states(env, states):
-    """Write these states, all slightly changed, and the same in every batch that gets them."""
+    """Write these states with a little noise. The noise is the same in every row and every batch."""
     generator = torch.Generator().manual_seed(0)
     noise = {
         k: {name: NOISE * torch.rand(t.shape[1], generator=generator) for name, t in v.items()}
@@ -323,11 +323,11 @@ def copy_states(env, states):
 
 @pytest.mark.parametrize("control_mode", ["pd_joint_delta_pos", "pd_ee_delta_pose"])
 def test_neighbours(build, control_mode):
-    """A row gives the same bits whatever its neighbours are and do, the same physics also at another place of a batch
-    of another size."""
+    """The bits of a row do not depend on the other rows. Its physics does not depend on its index or the size of the
+    batch either."""
     a, b, c = [build("StackCube-v1", n, control_mode=control_mode) for n in (3, 3, 7)]
     a.reset(seed=[1, 2, 3]), b.reset(seed=[4, 5, 6]), c.reset(seed=list(range(7)))
-    places = [6, 1, 4]  # of the rows of a in c
+    places = [6, 1, 4]  # rows of c that get the states of a's rows
     rng = np.random.RandomState(0)
     mine, theirs, far = [{k: v for k, v in env.get_state_dict().items() if k != "controller"} for env in (a, b, c)]
     for kind, tensors in mine.items():
@@ -342,7 +342,7 @@ def test_neighbours(build, control_mode):
         actions[2][places] = actions[0]
         results = [env.step(action) for env, action in zip((a, b, c), actions)]
         assert physics(a, 1) == physics(b, 1)
-        if "ee" not in control_mode:  # torch computes sines of vectors and of the rest of them differently
+        if "ee" not in control_mode:  # torch rounds sines differently in vectorised blocks and in the remainder
             assert [physics(a, i) for i in range(3)] == [physics(c, i) for i in places]
         parts = [dict(obs=r[0], reward=r[1], terminated=r[2], info=r[4]) for r in results]
         x, y, z = [{k: v for part, tree in p.items() for k, v in flat(tree, part).items()} for p in parts]
@@ -354,7 +354,7 @@ def test_neighbours(build, control_mode):
 
 @pytest.mark.parametrize("control_mode", ["pd_joint_delta_pos", "pd_ee_delta_pose"])
 def test_partial_reset(build, control_mode):
-    """Touches its rows only, to the last bit, and starts their episodes from the state of a reset."""
+    """A partial reset starts new episodes in its rows and leaves the others unchanged, to the last bit."""
     env = build("PickCube-v1", 4, control_mode=control_mode)
     env.reset(seed=[1, 2, 3, 4])
     rng = np.random.RandomState(0)
@@ -376,7 +376,7 @@ def test_partial_reset(build, control_mode):
 @pytest.mark.parametrize("env_id", ["PickCube-v1", "UnitreeG1Stand-v1"])
 @pytest.mark.parametrize("what", ["action", "state"])
 def test_not_finite(build, env_id, what):
-    """What is not finite in one row stays there, and a reset of that row ends it."""
+    """Numbers that are not finite stay in their row, and a reset of that row removes them."""
     broken, sound = [build(env_id, 3) for _ in range(2)]
     rng = np.random.RandomState(0)
     for env in (broken, sound):
@@ -405,7 +405,7 @@ def test_not_finite(build, env_id, what):
 
 
 def together(build, env_id, row=1, **kwargs):
-    """A batch of three and a single environment in the state of that row."""
+    """Returns a batch of three, and a single environment in the state of that row."""
     single, batch = build(env_id, 1, **kwargs), build(env_id, 3, **kwargs)
     single.reset(seed=0), batch.reset(seed=[0, 1, 2])
     bring_together(batch, single, row)
@@ -423,7 +423,7 @@ def step_both(batch, single, rng, row=1):
 
 
 def test_contact_forces(build):
-    """Net and pairwise, with the sign and the value of a single environment, after each step of the simulation."""
+    """Net and pairwise contact forces equal those of a single environment after each step of the simulation."""
     batch, single = together(build, "PickCube-v1")
     for env in (batch, single):
         pose = env.agent.tcp.pose.raw_pose.clone()
@@ -436,7 +436,7 @@ def test_contact_forces(build):
         action[:, 7] = -1  # close
         for env in (batch, single):
             env.step(action[: env.num_envs])
-            env.scene.step()  # not fetched: contacts are those of the last step of the simulation
+            env.scene.step()  # without a fetch: contacts are those of the last step of the simulation
         finger = [env.agent.finger1_link for env in (batch, single)]
         for a, b in ((batch.cube, single.cube), finger):
             assert equal(a.get_net_contact_forces(), b.get_net_contact_forces())
@@ -464,7 +464,7 @@ def test_contacts_are_not_asked_for_where_no_task_asks(build, monkeypatch):
         assert len(calls) == num_calls  # once a step for each environment, however many queries there are
 
 
-def test_what_bodies_and_joints_tell(build):
+def test_bodies_and_joints_report_their_state(build):
     batch, single = together(build, "PokeCube-v1")
     rng = np.random.RandomState(0)
     for step in range(6):
@@ -478,7 +478,7 @@ def test_what_bodies_and_joints_tell(build):
         step_both(batch, single, rng)
         a, b = batch.agent.robot, single.agent.robot
         for name in ("qpos", "qvel", "qacc", "qf", "drive_targets", "drive_velocities", "qlimits"):
-            if name == "qacc":  # of PhysX, whose values are large
+            if name == "qacc":  # PhysX computes it, and its values are large
                 assert torch.allclose(a.qacc[1:2], b.qacc, rtol=1e-3, atol=1e-2)
             else:
                 assert equal(getattr(a, name), getattr(b, name)), name
@@ -493,7 +493,7 @@ def test_what_bodies_and_joints_tell(build):
 
 
 def test_link_velocities_of_merged_links(build):
-    """Views may hold roots together with other links."""
+    """A merged view of a root and another link has the velocities of both."""
     env = build("PickCube-v1", 2)
     env.reset(seed=0)
     env.step(torch.ones(2, 8))
@@ -504,7 +504,7 @@ def test_link_velocities_of_merged_links(build):
 
 
 def test_a_robot_that_holds_still_stays_awake(build):
-    """PhysX lets a robot fall asleep whose drive targets nobody sets; a controller sets them, be they the same."""
+    """PhysX puts a robot to sleep if nothing sets its drive targets. Controllers set them, even to the same values."""
     for num_envs in (1, 2):
         env = build("PushCube-v1", num_envs, control_mode="pd_joint_pos")
         env.reset(seed=0)
@@ -516,7 +516,7 @@ def test_a_robot_that_holds_still_stays_awake(build):
 
 
 def test_states(build):
-    """What get_state and get_state_dict return gives the same states back, of all or of some environments."""
+    """States from get_state and get_state_dict can be restored, in all environments or in some."""
     env = build("StackCube-v1", 3)
     env.reset(seed=[0, 1, 2])
     rng = np.random.RandomState(0)
@@ -561,7 +561,7 @@ def test_reconfiguring_and_closing_free_memory():
 
 
 def test_recorded_trajectories(build, tmp_path):
-    """RecordEpisode writes an episode for each row, whose states and actions give the episode again."""
+    """RecordEpisode writes an episode for each row. A replay of its actions from its first state ends the same way."""
     env = build("PickCube-v1", 3)
     env = RecordEpisode(env, str(tmp_path), save_video=False, trajectory_name="batch", record_env_state=True)
     env.reset(seed=[5, 6, 7])
@@ -591,7 +591,7 @@ def test_recorded_trajectories(build, tmp_path):
 
 
 def trajectory():
-    """Every bit of the observations and rewards of a few steps of single environments."""
+    """Returns a hash of observations and rewards of single environments, and of their states after a rebuild."""
     digest = hashlib.sha256()
     for mode in ("pd_joint_delta_pos", "pd_ee_delta_pose"):
         env = make("PickCube-v1", 1, obs_mode="state", control_mode=mode)
@@ -608,12 +608,16 @@ def trajectory():
 
 @pytest.mark.slow
 def test_single_environments_are_untouched(build, tmp_path):
-    """Also in the same process as a batch: compared with a ppo.py that does not call batch_on_cpu."""
-    source = (ROOT / "ppo.py").read_text()
-    assert source.count("\nbatch_on_cpu()\n") == 1
-    (tmp_path / "ppo.py").write_text(source.replace("\nbatch_on_cpu()\n", "\nsapien_env.BaseEnv.build_seed = 2022\n"))
+    """Even in a process with a batch, they give the same bits as with a ppo.py that patches nothing for batches."""
+    source, patches = (
+        (ROOT / "ppo.py").read_text(),
+        "\nbatch_on_cpu()\nfind_rows()\nsolve_inverse_kinematics_of_batches()\n",
+    )
+    assert source.count(patches) == 1
+    (tmp_path / "ppo.py").write_text(source.replace(patches, "\nsapien_env.BaseEnv.build_seed = 2022\n"))
     process = subprocess.run(
-        [sys.executable, "-c", "import test_batch; print(test_batch.trajectory())"],
+        [sys.executable, "-c", "import ppo, test_batch; print(ppo.__file__, test_batch.trajectory())"],
+        cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT / "tests"), str(ROOT)])},
         capture_output=True,
         text=True,
@@ -623,7 +627,8 @@ def test_single_environments_are_untouched(build, tmp_path):
     batch = build("PickCube-v1", 2, control_mode="pd_ee_delta_pose")
     batch.reset(seed=0)
     batch.step(torch.ones(2, 7))
-    assert process.stdout.split()[-1] == trajectory()
+    file, result = process.stdout.split()[-2:]
+    assert Path(file).parent == tmp_path and result == trajectory()
     batch.step(torch.ones(2, 7))
 
 
@@ -636,7 +641,8 @@ TEXTURES = "rgb+depth+segmentation+position+normal+albedo"
 @pytest.mark.render
 @pytest.mark.parametrize("env_id", ["PickCube-v1", "MS-AntWalk-v1"])
 def test_pictures(build, env_id):
-    """Of sensors and of cameras that film, on links and on other bodies; objects that are hidden from the sensors."""
+    """Sensors and video cameras, on links and on other bodies, give the pictures of a single environment. Objects that
+    were hidden can be shown again."""
     kwargs = dict(obs_mode=TEXTURES, render_mode="rgb_array", render_backend="gpu")
     kwargs |= dict(
         sensor_configs=dict(width=64, height=64, shader_pack="default"),
@@ -661,7 +667,7 @@ def test_pictures(build, env_id):
         for name in b:
             assert a[name][1:2].shape == b[name].shape and a[name].dtype == b[name].dtype, name
             if "sensor_data" in name:
-                different = (a[name][1:2].double() - b[name].double()).abs() > 1  # mm, or one of 255
+                different = (a[name][1:2].double() - b[name].double()).abs() > 1  # a millimetre, or one of 255 levels
                 assert different.double().mean() < 1e-3, name
                 assert len(b[name].unique()) > 1, name
             else:

@@ -1,4 +1,4 @@
-"""examples/check_machine.py: true where all is well, and no crash where nothing is."""
+"""examples/check_machine.py reports what works, and does not crash where nothing works."""
 
 import os
 import shutil
@@ -39,7 +39,7 @@ def test_with_vulkan():
 
 
 def test_shared_memory(monkeypatch, capsys):
-    """What it says suffices is what ppo_rgb.py asks for."""
+    """The largest images that check_machine.py reports as possible are the largest that ppo_rgb.py accepts."""
     free = lambda mebibytes: monkeypatch.setattr(
         shutil, "disk_usage", lambda path: SimpleNamespace(free=mebibytes * 2**20)
     )
@@ -64,7 +64,7 @@ def test_shared_memory(monkeypatch, capsys):
 
 
 def test_where_all_is_broken(tmp_path):
-    """Modules that cannot be imported, or take the process with them."""
+    """The table reports modules that cannot be imported, and modules that crash the process."""
     (tmp_path / "torch.py").write_text("raise OSError('libtorch.so: cannot open shared object file')")
     (tmp_path / "sapien.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     table = check_machine(PYTHONPATH=str(tmp_path))

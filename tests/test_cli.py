@@ -1,4 +1,4 @@
-"""The script as a command: training, evaluating, filming, refusing."""
+"""The script as a command: it trains, evaluates, writes videos, and refuses bad flags."""
 
 import contextlib
 import json
@@ -40,7 +40,7 @@ def test_run_folder(trained):
     assert list(folder.glob("events.out.tfevents.*"))
     names = {"best.pt", "last.pt", "iteration_2.pt", "iteration_4.pt"}
     assert {path.name for path in folder.glob("*.pt")} == names and not (folder / "videos").exists()
-    assert errors == "", "without a terminal there is no bar, and no warning concerns the user"
+    assert errors == "", "without a terminal there must be no progress bar and no warning"
     assert output.count("evaluation:") == 4 and "runs/small" in output
 
 
@@ -70,7 +70,7 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
         low, high = results[f"{key}_interval"]
         assert low <= results[key] <= high and f"{results[key]:.3f}" in output
     assert not list(tmp_path.iterdir()), "everything is written next to the checkpoint"
-    # the last evaluation of the training run, once more; PhysX remembers contacts of the episodes before
+    # repeat the last evaluation of the training run; PhysX remembers contacts of earlier episodes, so it is not exact
     assert ppo.main([*map(str, command), "--num_eval_episodes", "6", "--num_eval_envs", "2"]) == 0
     last = json.loads((folder / "metrics.jsonl").read_text().splitlines()[-1])
     results = json.loads((folder / "eval.json").read_text())
@@ -80,13 +80,14 @@ def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, cap
 
 
 def test_a_run_folder_stands_for_its_last_checkpoint(trained):
-    """Results of --evaluate go into that folder."""
+    """--checkpoint accepts a run folder, and the results of --evaluate go into that folder."""
     args = ppo.parse_args(["--evaluate", "--checkpoint", str(trained[0])])
     assert args.checkpoint == str(trained[0] / "last.pt") and ppo.find_run_dir(args) == trained[0]
 
 
 def test_wilson_interval():
-    """Reference values of the score interval, to three digits (Newcombe 1998, table I: 81/263, 15/148, 0/20, 1/29)."""
+    """Rates get the score interval, to three digits (Newcombe 1998, table I: 81/263, 15/148, 0/20, 1/29). Other means
+    get the normal interval."""
     for successes, n, low, high in (
         (81, 263, 0.2553, 0.3662),
         (15, 148, 0.0624, 0.1605),
@@ -106,7 +107,7 @@ def test_refusal_as_a_command(tmp_path):
 
 
 def test_commands_for_the_peers_scripts_parse(trained):
-    """Flags as ManiSkill's ppo.py and ppo_fast.py and CleanRL's scripts spell them."""
+    """Flags parse as ManiSkill's ppo.py and ppo_fast.py and CleanRL's scripts spell them."""
     args = ppo.parse_args(
         "--env_id=PushCube-v1 --num_envs=2048 --update_epochs=8 --num_minibatches=32 --total_timesteps=2_000_000 "
         "--eval_freq=10 --num-steps=20 --seed 5 --gamma=0.99 --gae_lambda 0.95 --no-capture_video --save_trajectory "
@@ -120,7 +121,7 @@ def test_commands_for_the_peers_scripts_parse(trained):
     )
     assert (args.num_envs, args.num_steps, args.total_timesteps, args.target_kl) == (2048, 20, 2_000_000, None)
     assert args.anneal_lr and not args.norm_adv and not args.capture_video and args.cudagraphs and args.track
-    assert args.norm_obs, "the network that the checkpoint was trained with"
+    assert args.norm_obs, "--checkpoint must bring its network along"
     assert (args.control_mode, args.batch_size, args.num_iterations) == ("pd_ee_delta_pose", 40960, 48)
 
 
@@ -141,8 +142,8 @@ def test_defaults_by_backend(monkeypatch):
         patch.setattr(ppo, "WORLD_SIZE", 2)
         patch.setattr(ppo, "LOCAL_RANK", 1)
         local = ppo.local_args(ppo.parse_args([]))
-        assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process of torchrun has its own"
-    assert args.num_eval_envs >= args.num_eval_episodes, "one round of evaluation episodes"
+        assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process has its own GPU"
+    assert args.num_eval_envs >= args.num_eval_episodes, "an evaluation must take one round of episodes"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
@@ -152,7 +153,7 @@ def test_defaults_by_backend(monkeypatch):
 
 
 def test_training_and_evaluation_set_the_device_of_the_simulation(monkeypatch):
-    """CUDA graphs are captured on torch's current device."""
+    """Both functions make the GPU that simulates torch's current device, because CUDA graphs are captured there."""
     devices = []
     monkeypatch.setattr(torch.cuda, "set_device", devices.append)
     device, _ = ppo.start_processes(ppo.Args(sim_backend="physx_cuda:1", exp_name="x"), None)
@@ -182,7 +183,7 @@ def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
 
 @pytest.mark.slow
 def test_other_kinds_of_task(tmp_path):
-    """Dict action spaces, tasks without success, other robots, sparse reward: built and trained without Vulkan."""
+    """Tasks with Dict action spaces, without success, with other robots or with sparse reward train without Vulkan."""
     env_ids = ("TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1")
     flags = [*map(str, TINY), "--num_envs", "2", "--num_actors", "1", "--env_kwargs", '{"max_episode_steps": 10}']
     (tmp_path / "all.py").write_text(f"""
@@ -242,12 +243,12 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
     assert [kind for kind, line in zip(kinds, staying) if kind in line] == kinds, staying
     assert len(staying) == len(kinds)
     bars = [piece for piece in text.replace("\n", "\r").split("\r") if "steps/s" in piece]
-    assert bars and all("return" in piece and "<" in piece for piece in bars), "step, time left, rate and return"
+    assert bars and all("return" in piece and "<" in piece for piece in bars), "time left, rate and return"
 
 
 @pytest.mark.slow
 def test_weights_do_not_depend_on_evaluation_with_real_tasks(in_tmp):
-    """Evaluation and training share two processes."""
+    """Evaluation does not change the weights, although it shares two processes with training."""
     for freq in (1, 0):
         flags = (*TINY, "--num_envs", 4, "--num_actors", 2, "--total_timesteps", 160, "--exp-name", freq,
                  "--eval_freq", freq, "--env_kwargs", '{"max_episode_steps": 15}')  # fmt: skip
@@ -271,7 +272,7 @@ class Whole(PushCubeEnv):
 
 
 def test_task_that_cannot_reset_some_environments(in_tmp, monkeypatch, capsys):
-    """Is refused in one line, and both remedies that the line names work."""
+    """The task is refused in one line, and both remedies that the line names work."""
     (in_tmp / "whole.py").write_text(CANNOT_RESET_SOME)
     monkeypatch.syspath_prepend(in_tmp)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -302,8 +303,8 @@ def test_videos_and_trajectories(in_tmp, capfd):
         "step_000000020.mp4", "step_000000040.mp4"
     ]  # fmt: skip
     images = frames(run / "videos" / videos[0])
-    assert 8 <= len(images) <= 10 and images.std() > 10, "a filmed scene is not of one colour"
-    # one file an actor, with its part of the episodes; ManiSkill's own tool replays them to the same states
+    assert 8 <= len(images) <= 10 and images.std() > 10, "the frames must not be of one colour"
+    # each actor writes one file with its part of the episodes; ManiSkill's own tool can replay them
     files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
     assert files == [f"trajectory_{i}.{suffix}" for i in range(2) for suffix in ("h5", "json")]
     episodes = json.loads((run / "videos/trajectory_1.json").read_text())["episodes"]
@@ -326,8 +327,8 @@ def test_videos_and_trajectories(in_tmp, capfd):
 
 
 @pytest.mark.render
-def test_a_film_holds_no_more_than_a_frame(tmp_path, monkeypatch):
-    """A thousand of them would take a gigabyte."""
+def test_a_film_holds_no_more_than_two_frames(tmp_path, monkeypatch):
+    """At most two frames are in memory at a time: a thousand would take a gigabyte."""
     frames = []
 
     class Writer(contextlib.ExitStack):
@@ -347,7 +348,7 @@ def test_a_film_holds_no_more_than_a_frame(tmp_path, monkeypatch):
 
 @pytest.mark.render
 def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, monkeypatch):
-    """And leaves nothing behind in the next one."""
+    """The error is printed, no file is left behind, and the next video is complete."""
 
     def full(*args, **kwargs):
         raise OSError("No space left on device")
@@ -369,11 +370,11 @@ def test_a_video_that_cannot_be_written_does_not_end_the_run(tmp_path, capsys, m
 
 @pytest.mark.slow
 def test_learns_a_task_of_maniskill(tmp_path):
-    """With the defaults, as a user would; a task that is cheap to simulate."""
+    """The command learns a task that is cheap to simulate, with most flags at their defaults."""
     flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 32_000,
              "--eval_freq", 0, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--exp-name", "x",
              "--no-cuda")  # fmt: skip
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
     assert process.returncode == 0, process.stderr
     first, last = [row["return"] for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "eval"]
-    assert first < 150 and last > 500, "of 1,000"
+    assert first < 150 and last > 500, "the highest return is 1,000"

@@ -27,8 +27,8 @@ ARGS = ppo.Args(
 
 
 def evaluate_with(args, agent, monkeypatch, again=False):
-    """The evaluation by all actors of a run, here one after the other: first observations and metrics. `again`: those
-    of a second evaluation in the same scenes."""
+    """Evaluate with all actors of a run, here one after the other; returns the first observations and the metrics. With
+    `again`, they are those of a second evaluation in the same scenes."""
     start_episodes, first_obs, parts = ppo.start_episodes, [], []
     for index in range(args.num_actors):
         of_actor = []
@@ -50,7 +50,7 @@ def evaluate_with(args, agent, monkeypatch, again=False):
 
 
 def plain_loop(args, agent):
-    """ManiSkill's single environment, one episode after the other, and nothing of ours but the network."""
+    """Play one episode after the other in ManiSkill's single environment. Only the network is ours."""
     kwargs = dict(num_envs=1, sim_backend="physx_cpu", render_backend="none", max_episode_steps=STEPS)
     kwargs |= dict(obs_mode="state", reward_mode="normalized_dense", control_mode=args.control_mode)
     env = gym.make(args.env_id, **kwargs)
@@ -75,7 +75,8 @@ def plain_loop(args, agent):
 
 
 def by_row(function):
-    """The network rounds one row as any number of them: contacts would make of the last bit another episode."""
+    """Compute each row alone, so that rounding does not depend on the number of rows. With contacts, a difference in
+    the last bit leads to another episode."""
     return lambda obs: torch.cat([function(row[None]) for row in obs])
 
 
@@ -84,7 +85,7 @@ def by_row(function):
     [k if k in ("PushCube-v1", "MS-CartpoleBalance-v1") else pytest.param(k, marks=pytest.mark.slow) for k in TASKS],
 )
 def test_independent_of_environments_and_actors(env_id, monkeypatch):
-    """Nor does it matter what was played in the same scenes before, or whether the last round is full."""
+    """Episodes do not depend on earlier episodes in the same scenes either, or on whether the last round is full."""
     args = replace(ARGS, env_id=env_id, control_mode=TASKS[env_id])
     env = ppo.make_env(args, 1)
     action_space = env.get_wrapper_attr("single_action_space")
@@ -104,7 +105,7 @@ def test_independent_of_environments_and_actors(env_id, monkeypatch):
 
 
 class Reach(BatchedReach):
-    """Reach where a success or a failure may pass again, and with uneven action bounds."""
+    """BatchedReach where success and failure may be temporary, with uneven action bounds."""
 
     def __init__(self, num_envs):
         super().__init__(num_envs, "cpu")
@@ -119,7 +120,7 @@ class Reach(BatchedReach):
 @pytest.mark.parametrize("num_steps", [6, 20])
 @pytest.mark.parametrize("ends_early", [False, True])
 def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
-    """An episode counts up to its end: by success or failure where that is asked for, the time limit, or num_steps."""
+    """An episode counts up to its end: the time limit, num_steps, or, with eval_partial_reset, success or failure."""
     args = replace(SMALL, eval_partial_reset=ends_early, norm_obs=True)
     agent = make_agent(box(4), Reach(1).single_action_space, args)
     agent.actor_mean[-1].weight.data *= 4
@@ -147,7 +148,7 @@ def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
         spy = Spy(Reach(num_envs))
         envs = ppo.ManiSkillVectorEnv(spy, auto_reset=False, ignore_terminations=not ends_early, record_metrics=True)
         metrics = ppo.evaluate(agent, envs, 40, SEED, num_steps)
-        assert len(spy.steps) == math.ceil(40 / num_envs) * num_steps, "none is simulated for nothing"
+        assert len(spy.steps) == math.ceil(40 / num_envs) * num_steps, "no other steps may be simulated"
         assert metrics.keys() == wanted.keys()
         for key, values in wanted.items():
             assert metrics[key].tolist() == pytest.approx(values, rel=1e-3), key
@@ -162,7 +163,7 @@ def test_exploring_takes_random_actions_and_all_else_does_not():
 
 @pytest.mark.parametrize("num_episodes", [1, 2, 5])
 def test_each_actor_has_its_part_of_the_episodes(num_episodes, monkeypatch):
-    """Also where there are fewer episodes than actors, or than environments."""
+    """The parts make up all episodes, even with fewer episodes than actors or environments."""
     seeds = []
 
     def spy(envs, episode_seeds, separately):

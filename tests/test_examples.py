@@ -1,10 +1,8 @@
-"""The example tasks: their episodes follow from their seeds alone, on every backend; and the faults that
-tests/test_task.py is to find, put into copies of one of them."""
+"""The example tasks: each episode follows from its seed alone. And tests/test_task.py finds faults that are put into
+copies of an example."""
 
 import importlib
 import json
-import os
-import subprocess
 
 import gymnasium as gym
 import numpy as np
@@ -25,13 +23,13 @@ from mani_skill.utils.structs import Pose
     "env_id",
     [
         *EXAMPLES,
-        # torch's global generator, and the robot's joints from the generator of the first environment: when this one
-        # passes, ManiSkill was mended, and the examples can become simpler
+        # It draws from torch's global generator, and the robot's joints from the generator of the first environment.
+        # When it passes, ManiSkill has fixed this, and the examples can become simpler.
         pytest.param("PushCube-v1", marks=pytest.mark.xfail(strict=True, raises=AssertionError)),
     ],
 )
 def test_episodes_follow_from_their_seeds(env_id):
-    """Whenever an environment resets, and whichever others do with it."""
+    """An episode does not depend on when its environment resets, or on the environments that reset with it."""
     env = make(env_id, num_envs=NUM_ENVS)
     histories = []
     for groups in ([[0, 1, 2, 3, 4]] * 2, [[2], [0, 1], [2, 3], [1, 4], [0, 3, 4]]):
@@ -52,7 +50,7 @@ def test_episodes_follow_from_their_seeds(env_id):
 
 @pytest.mark.parametrize("env_id", EXAMPLES)
 def test_same_start_in_a_batch_as_alone(env_id):
-    """Each environment of a batch starts as one alone does with its seed, blocks of many sizes included."""
+    """An environment in a batch starts like one alone with the same seed. Blocks have the same sizes, too."""
     options = dict(reconfigure=True)
     alone = []
     env = make(env_id, num_envs=1)
@@ -67,7 +65,7 @@ def test_same_start_in_a_batch_as_alone(env_id):
 
 
 def play(num_envs, seeds, actions):
-    """The curriculum: observations, rewards, levels, and where episodes ended, of all steps."""
+    """Play the curriculum; returns the observations, rewards, ends of episodes and levels of all steps."""
     envs = ppo.ManiSkillVectorEnv(make(EXAMPLES[2], num_envs=num_envs, max_episode_steps=9), record_metrics=True)
     obs, _ = envs.reset(seed=seeds)
     steps = []
@@ -90,7 +88,7 @@ def test_batch_equals_single_environments():
 
 
 def test_full_table(monkeypatch):
-    """Blocks for which there is no place lie on the floor, not in each other; the others are where they were."""
+    """Blocks that find no place on the table lie on the floor, and no blocks overlap."""
     from examples.push_from_clutter import PushFromClutterEnv
 
     monkeypatch.setattr(PushFromClutterEnv, "num_blocks", 30)
@@ -110,42 +108,42 @@ def test_curriculum():
     envs = ppo.ManiSkillVectorEnv(make(EXAMPLES[2], num_envs=4, max_episode_steps=5), record_metrics=True)
     task, still = envs.base_env, torch.zeros(4, 8)
     envs.reset(seed=[0, 1, 2, 3])
-    assert task.difficulty.tolist() == [1, 1, 1, 1], "an episode from a seed is of the task itself"
-    for _ in range(5):  # nothing is learned of the level from it
+    assert task.difficulty.tolist() == [1, 1, 1, 1], "an episode that starts from a seed must have full difficulty"
+    for _ in range(5):  # an episode with full difficulty does not change the level
         infos = envs.step(still)[-1]
     assert infos["_final_info"].all() and task.difficulty.tolist() == task.level.tolist() == [0, 0, 0, 0]
     near = torch.linalg.norm(task.goal.pose.p - task.cube.pose.p, dim=1).max()
-    for episode in range(4):  # the first two environments succeed at once, the others not
+    for episode in range(4):  # the first two environments succeed at once, the others do not
         task.scene._reset_mask[2:] = False
         task.cube.set_pose(at_goal(task, 2))
         task.scene._reset_mask[:] = True
         task.scene._gpu_apply_all()
         task.scene._gpu_fetch_all()
         infos = envs.step(still)[-1]
-        assert infos["_final_info"].tolist() == [True, True, episode == 4, episode == 4]
+        assert infos["_final_info"].tolist() == [True, True, False, False]
         assert infos["final_info"]["level"][:2].tolist() == pytest.approx([0.1 * episode] * 2)
     assert task.level.tolist() == pytest.approx([0.4, 0.4, 0, 0])
     for _ in range(5):
         envs.step(still)
-    assert task.level.tolist() == pytest.approx([0.1, 0.1, 0, 0]), "as much lower after a failure as three raise it"
+    assert task.level.tolist() == pytest.approx([0.1, 0.1, 0, 0]), "a failure must lower the level by three steps"
     envs.reset(options={"env_idx": torch.tensor([1, 3]), "difficulty": torch.tensor([0.25, 0.75])})
     assert task.difficulty[[1, 3]].tolist() == [0.25, 0.75]
     state = task.get_state_dict()
     envs.reset(options={"reset_to_env_states": {"env_states": state}})
-    assert task.level.tolist() == pytest.approx([0.1, 0.1, 0, 0]), "which is no episode"
+    assert task.level.tolist() == pytest.approx([0.1, 0.1, 0, 0]), "restoring a state must not change the level"
     far = envs.reset(seed=[0, 1, 2, 3]) and torch.linalg.norm(task.goal.pose.p - task.cube.pose.p, dim=1).max()
     assert near < 0.125 < far
     envs.close()
 
 
 def at_goal(task, count):
-    """Where the cube is at its goal, for the first environments."""
+    """Returns the pose of a cube that is at its goal, for the first `count` environments."""
     position = task.goal.pose.p[:count].clone()
     position[:, 2] = task.cube_half_size
     return Pose.create_from_pq(position)
 
 
-# --- what the tester finds ---
+# --- faults that tests/test_task.py finds ---
 
 FAULTS = {
     "ignores env_idx": (
@@ -228,31 +226,25 @@ def test_trains(env_id, in_tmp):
     assert ("final_level" in rows[1]) == ("curriculum" in env_id)
 
 
-def test_recipes_are_commands(tmp_path, monkeypatch):
-    """Each parses, and is not refused; nothing is run."""
-    fake = tmp_path / "python"
-    fake.write_text('#!/bin/sh\nfor x in "$@"; do printf "%s\\0" "$x"; done\n')
-    fake.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.chdir(tmp_path)
+def test_recipes_are_commands(run_recipe, in_tmp, monkeypatch):
+    """Each recipe parses and is not refused. Nothing is trained."""
     monkeypatch.setattr(ppo_rgb, "RENDER_DEVICE", ppo_rgb.sapien.Device("cpu"))
-    recipe = lambda *names: subprocess.run(
-        ["bash", ROOT / "examples/recipes.sh", *names], capture_output=True, text=True
-    )
-    names = recipe().stderr.split("names:")[1].split()
+    _, error = run_recipe()
+    names = error.split("names:")[1].split()
     assert len(names) > 10
     for name in names:
-        script, *flags = recipe(name, "--seed", "3").stdout.split("\0")[:-1]
+        (script, *flags), _ = run_recipe(name, "--seed", "3")
         module = {"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script]
         args = module.parse_args(flags)
         module.check(args)
         assert args.seed == 3 and ("cpu" in name) == ("--no-cuda" in flags)
+        assert ("images" in name) == (script == "ppo_rgb.py")
 
 
 @pytest.mark.render
 @pytest.mark.parametrize("env_id", EXAMPLES)
 def test_from_images(env_id):
-    """Cameras show the objects, and not the goal, which is in the state."""
+    """Cameras show the objects but not the goal. The state contains the goal."""
     args = ppo_rgb.Args(env_id=env_id, sim_backend="physx_cpu", camera_width=64, camera_height=64, shader="minimal")
     env = ppo_rgb.make_env(args, 1)
     task = env.unwrapped
@@ -260,7 +252,7 @@ def test_from_images(env_id):
     assert obs["rgb"].shape == (1, 64, 64, 3)
 
     def see(actor, position):
-        """Which pixels change when this is put there; and what else is told of it."""
+        """Move an object; returns how many pixels change, and which other observations change."""
         before = task.get_obs()
         actor.set_pose(Pose.create_from_pq(position))
         after = task.get_obs()

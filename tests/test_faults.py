@@ -1,4 +1,4 @@
-"""Stopping, continuing and failing: on the torch-native environments in this process where that shows it, else through
+"""Stopping, resuming and failing. Most tests train on the torch-native environments in this process; the others run
 the command with real tasks."""
 
 import contextlib
@@ -54,7 +54,8 @@ RUN = dict(
 
 @pytest.mark.parametrize("iteration, action", [(0, crash), (2, signal_self), (5, crash), (6, signal_self), (11, crash)])
 def test_exact_resume_is_bit_identical(train, in_update, in_tmp, iteration, action):
-    """Wherever the stop falls, in the middle of an update too: all ends as if it had not been."""
+    """A run that stops anywhere, even in the middle of an update, and is resumed ends with the same bits as one that
+    never stopped."""
     metrics, *_ = train(**RUN, exact_resume=True)
     in_update(iteration, action)
     if action is crash:
@@ -64,14 +65,14 @@ def test_exact_resume_is_bit_identical(train, in_update, in_tmp, iteration, acti
         assert train(**RUN, exact_resume=True)[2] == 128 + signal.SIGTERM
     stopped = ppo.load_checkpoint("runs/run2/last.pt")
     finished = iteration + (action is signal_self)
-    assert stopped["iteration"] == finished // 3 * 3, "the last boundary"
+    assert stopped["iteration"] == finished // 3 * 3, "last.pt must be from the last boundary"
     assert train(**RUN, exact_resume=True, resume="runs/run2")[2] == 0
     assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
     assert len(metrics) == 12 + 4 and len(scalars("runs/run2")["train/value_loss"]) == 12
 
 
 def test_exact_resume_with_gpu_simulation(train, in_update, in_tmp, monkeypatch, device):
-    """Where scenes are not built again: episodes start at the same iterations, stopped or not."""
+    """With GPU simulation scenes are not rebuilt. Episodes restart at the same iterations, stopped or not."""
     monkeypatch.setattr(ppo, "choose_device", lambda args: device)
     flags = RUN | dict(exact_resume=True, sim_backend="physx_cuda")
     train(**flags)
@@ -83,19 +84,21 @@ def test_exact_resume_with_gpu_simulation(train, in_update, in_tmp, monkeypatch,
 
 
 def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
-    """From every checkpoint of a whole run the same end is reached; and its boundaries do restart the episodes."""
+    """Resuming from any checkpoint of a finished run reaches the same end. The flag does change the run: episodes
+    restart at each checkpoint."""
     train(**RUN | dict(save_freq=3), exact_resume=True)
     for iteration in (3, 6, 9):
         shutil.copytree("runs/run1", f"runs/again{iteration}")
         train(**RUN | dict(save_freq=3), exact_resume=True, resume=f"runs/again{iteration}/iteration_{iteration}.pt")
         assert same_run(in_tmp / "runs/run1", in_tmp / f"runs/again{iteration}")
     _, other, _ = train(**RUN)
-    assert not same_weights(other, ppo.load_checkpoint("runs/run1/last.pt")), "or the flag changes nothing"
+    assert not same_weights(other, ppo.load_checkpoint("runs/run1/last.pt")), "the flag must change the run"
 
 
 @pytest.mark.parametrize("action", [crash, signal_self])
 def test_resume_twice_is_the_same_twice(train, in_update, in_tmp, action):
-    """Without --exact_resume: what was finished is kept, nothing is there twice, and it is repeatable."""
+    """Without --exact_resume, a resumed run keeps all finished iterations and repeats no row. Resuming twice gives the
+    same result."""
     in_update(7, action)
     if action is crash:
         with pytest.raises(Stop):
@@ -103,7 +106,7 @@ def test_resume_twice_is_the_same_twice(train, in_update, in_tmp, action):
     else:
         assert train(**RUN)[2] == 143
     stopped = ppo.load_checkpoint("runs/run1/last.pt")
-    assert stopped["iteration"] == (7 if action is crash else 8), "half an update is not kept, a finished one is"
+    assert stopped["iteration"] == (7 if action is crash else 8), "only a finished update may be kept"
     shutil.copytree("runs/run1", "runs/again")
     for name in ("run1", "again"):
         metrics, last, _ = train(**RUN, resume=f"runs/{name}")
@@ -133,7 +136,7 @@ def test_a_finished_run_can_go_on(train, in_tmp):
 
 
 def test_signal_in_the_last_iteration(train, in_update, in_tmp):
-    """Is a stop, not an end: the last evaluation is still to come."""
+    """The signal stops the run before its last evaluation. Resuming it runs that evaluation."""
     in_update(11, signal_self)
     metrics, last, code = train(**RUN)
     assert code == 143 and last["iteration"] == 12 and metrics[-1]["kind"] == "train"
@@ -142,7 +145,7 @@ def test_signal_in_the_last_iteration(train, in_update, in_tmp):
 
 
 def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
-    """Though the run goes on from a checkpoint that is older than the best."""
+    """This holds even if the run resumes from a checkpoint that is older than best.pt."""
     train(**RUN)
     best = ppo.load_checkpoint("runs/run1/best.pt")
     ppo.save_checkpoint(Path("runs/run1/best.pt"), best | {"best_score": [1.0, 20.0]})
@@ -152,7 +155,7 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
 
 
 def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
-    """Fewer are refused; of a run that is finished the line says so at once. Neither changes the run."""
+    """Fewer steps are refused. With as many, the script prints that the run is finished. Neither changes the run."""
     metrics, *_ = train(total_timesteps=320 * 4)
     for steps, code, words in ((320 * 3, 2, "the run already has 1280 steps"), (320 * 4, 0, "the run is finished")):
         with pytest.raises(SystemExit) as error:
@@ -164,7 +167,7 @@ def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
 
 
 def test_checkpoint_minutes(train, in_update, in_tmp):
-    """A crash that leaves no time to write costs what came since the last checkpoint: by iterations or by minutes."""
+    """last.pt is written every checkpoint_freq iterations, and also when it is older than checkpoint_minutes."""
     saved = {}
 
     def look():
@@ -194,7 +197,7 @@ def test_checkpoints_move_between_devices(in_tmp, monkeypatch, first, second):
 
 
 def poison(monkeypatch, quantity, at, value=float("nan"), env_idx=(3, 7)):
-    """Let some training environments return a value that is not finite in the steps `at`."""
+    """Make some training environments return `value` in the steps `at`."""
     step, calls = batched_env.BatchedReach.step, []
 
     def poisoned(self, actions):
@@ -204,7 +207,7 @@ def poison(monkeypatch, quantity, at, value=float("nan"), env_idx=(3, 7)):
             if len(calls) in at:
                 (obs if quantity == "observation" else reward)[list(env_idx)] = value
                 if quantity == "observation":
-                    self.state[list(env_idx)] = value  # it stays, until a reset
+                    self.state[list(env_idx)] = value  # it stays until a reset
         return obs, reward, terminated, truncated, info
 
     monkeypatch.setattr(batched_env.BatchedReach, "step", poisoned)
@@ -213,7 +216,7 @@ def poison(monkeypatch, quantity, at, value=float("nan"), env_idx=(3, 7)):
 @pytest.mark.parametrize("quantity", ["observation", "reward"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_non_finite_steps_skip_one_update(train, in_tmp, monkeypatch, capsys, quantity, value):
-    """The third iteration's update is not applied, those environments are reset, then training goes on."""
+    """The third iteration skips its update, the affected environments are reset, and training goes on."""
     poison(monkeypatch, quantity, at=[25], value=value)
     metrics, last, _ = train(**RUN | dict(save_freq=1))
     assert [row["update_skipped"] for row in metrics if row["kind"] == "train"] == [0, 0, 1] + [0] * 9
@@ -228,7 +231,7 @@ def test_non_finite_steps_skip_one_update(train, in_tmp, monkeypatch, capsys, qu
 
 
 def test_an_update_that_spoils_the_weights_ends_the_run(train, in_tmp, monkeypatch):
-    """last.pt holds the weights before it, also where it had begun to change them."""
+    """last.pt holds the weights from before the update, even though earlier minibatches had already changed them."""
     update, calls = ppo.update_minibatch, []
 
     def overflowing(agent, optimizer, args, *, returns, **others):
@@ -267,7 +270,7 @@ def test_numbers_that_stay_non_finite_end_the_run(train, in_tmp, monkeypatch):
 
 
 def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, monkeypatch, capsys):
-    """/dev/full in place of the file that is written first: one line, and the old checkpoint stays whole."""
+    """The run ends with one line, and the old checkpoint stays whole. /dev/full stands in for the temporary file."""
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
     in_update(1, lambda: Path("runs/x/last.tmp").symlink_to("/dev/full"))
     flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
@@ -282,7 +285,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
 
 
 def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
-    """Where metrics.jsonl cannot grow: the run ends, and goes on later without a gap or a broken row."""
+    """If metrics.jsonl cannot grow, the run ends. When it is resumed, no row is missing or broken."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill():
@@ -312,7 +315,7 @@ class Foreign:
     + [(flag, how) for flag in ("--resume", "--evaluate") for how in ("truncated", "task")],
 )
 def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, flag, how, capsys):
-    """The line names the file; and for another task, what was expected and what was found. Nothing is written."""
+    """The line names the file and, for another task, the expected and the found shape. Nothing is written."""
     shutil.copytree(trained[0], "runs/x")
     path, content = Path("runs/x/bad.pt"), (trained[0] / "last.pt").read_bytes()
     checkpoint = ppo.load_checkpoint(trained[0] / "last.pt")
@@ -351,7 +354,8 @@ def test_unfit_checkpoints_are_refused_in_one_line(trained, in_tmp, flag, how, c
 
 
 def test_flags_of_a_resumed_run(trained, in_tmp, capsys):
-    """The command line wins, except over what fixes the task and the network; what changes is printed."""
+    """Flags on the command line replace those of the run, except those that fix the task and the network. Changes are
+    printed."""
     shutil.copytree(trained[0], "runs/x")
     for flags in ("--env_id PickCube-v1", "--no-norm_obs", "--control_mode pd_joint_pos", "--evaluate",
                   "--checkpoint runs/x/best.pt"):  # fmt: skip
@@ -367,7 +371,7 @@ def test_flags_of_a_resumed_run(trained, in_tmp, capsys):
 
 
 def test_learning_rates_of_a_resumed_run(device):
-    """One that was adapted goes on from where it was; a changed flag starts from its value."""
+    """An adapted learning rate keeps its last value, unless its flag has changed."""
     args = ppo.Args(learning_rate=1e-3, desired_kl=0.01)
     agent = ppo.Agent(box(4), ACTIONS, args).to(device)
     saved = ppo.make_optimizer(agent, args, device)
@@ -388,13 +392,14 @@ TINY = ("--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 1, "--num_eval_ep
 
 
 def shared_files():
-    """Without semaphores, which the processes of other tests create meanwhile."""
+    """Ignores semaphores: other tests create them at the same time."""
     return {path for path in Path("/dev/shm").glob("*") if not path.name.startswith("sem.mp-")}
 
 
 @pytest.fixture
 def start(tmp_path):
-    """Start the script in a process group of its own, wait until it trains; what it leaves behind is a defect."""
+    """A function that starts the script in its own process group and waits until it trains. The test fails if the
+    script leaves processes or shared memory behind."""
     started = []
 
     def run(*flags, wait_for_rows=2, **environment):
@@ -425,7 +430,7 @@ def start(tmp_path):
 
 
 def test_signals_finish_the_iteration(train, in_update, in_tmp):
-    """Exit code 128 + n."""
+    """The run finishes its iteration, writes last.pt, and exits with 128 + the number of the signal."""
     for n, signum in enumerate((signal.SIGTERM, signal.SIGINT, signal.SIGUSR1), start=1):
         in_update(2, lambda signum=signum: os.kill(os.getpid(), signum))
         assert train(**RUN)[2] == 128 + signum
@@ -433,7 +438,7 @@ def test_signals_finish_the_iteration(train, in_update, in_tmp):
 
 
 def test_control_c_in_a_terminal(start, tmp_path, monkeypatch, capsys):
-    """Which all processes receive: the run ends as with any signal, and continues from there."""
+    """Ctrl-C reaches all processes. The run stops as with any other signal, and can be resumed."""
     process, _ = start(*TINY)
     os.killpg(process.pid, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
@@ -456,7 +461,7 @@ def test_a_second_signal_ends_it_at_once(start):
     time.sleep(1)
     os.killpg(process.pid, signal.SIGINT)
     time.sleep(1)
-    assert process.poll() is None, "the iteration, a long one, is still to be finished"
+    assert process.poll() is None, "the first signal must let the long iteration go on"
     os.killpg(process.pid, signal.SIGINT)
     process.wait(timeout=5)
     assert process.returncode == -signal.SIGINT
@@ -513,7 +518,7 @@ def write_task(monkeypatch, name, **parts):
 
 @pytest.mark.parametrize("in_main_process", [True, False])
 def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
-    """In actor 0, then in the other one: the traceback of the task."""
+    """An error of the task in either actor ends the run with the task's traceback, and last.pt is safe."""
     name = "Mistaken" + "Main" * in_main_process
     task = write_task(monkeypatch, name, fault="raise ValueError('my own mistake')", in_main_process=in_main_process)
     assert ppo.main([*map(str, (*TINY, *task))]) == 1
@@ -525,8 +530,8 @@ def test_error_of_a_task(in_tmp, monkeypatch, capfd, in_main_process):
 
 @pytest.mark.parametrize("in_main_process", [True, False])
 def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_process):
-    """A cube at nowhere in one environment of a real batch: that environment starts a new episode, the others go on,
-    and one update is skipped."""
+    """When the position of a cube becomes NaN in one environment of a real batch, that environment starts a new
+    episode, the others go on, and one update is skipped."""
     fault = """
             from mani_skill.utils.structs import Pose
             poses = self.obj.pose.raw_pose.clone()
@@ -541,36 +546,37 @@ def test_physics_that_explode_are_survived(in_tmp, monkeypatch, capfd, in_main_p
     output = capfd.readouterr()
     assert [row["update_skipped"] for row in rows] == [1, 0, 0, 0], output
     assert f"no update: non-finite observation or reward in environments [{1 if in_main_process else 3}]" in output.out
-    # ends after 50 and 100 steps; the one that began after 30 ends after 80
+    # episodes end after 50 and 100 steps; the one that began after 30 ends after 80
     assert [row["num_episodes"] for row in rows] == [0, 3, 1, 3]
     assert all(math.isfinite(row.get("return", 0)) for row in rows)
 
 
 def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, capsys):
-    """Where it would end in a "Bus error": before anything is written, and with the remedy. One actor needs none."""
+    """The script refuses the run before it writes anything, and names remedies; otherwise the run would end in a
+    "Bus error". One actor needs no shared memory."""
     usage, asked = shutil.disk_usage, []
     tiny = lambda path: asked.append(str(path)) or usage("/")._replace(free=2**16)
     monkeypatch.setattr(shutil, "disk_usage", tiny)
     line = refused(TINY, capsys)
     assert re.search(r"needs \d+ MiB of shared memory, and 0 are free", line) and asked == ["/dev/shm"]
     assert all(remedy in line for remedy in ("--shm-size", "fewer environments", "--num_actors 1"))
-    assert not multiprocessing.active_children(), "the other actor has ended"
+    assert not multiprocessing.active_children(), "the other actor must have ended"
     assert train()[2] == 0
 
 
 def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
-    """The same run resumed while it still goes on would write every row twice."""
+    """A run cannot be resumed while it is still running: two processes would write every row twice."""
     lines = []
     in_update(3, lambda: lines.append(refused(["--resume", "runs/run1", "--no-cuda"], capsys)))
     metrics, *_ = train(**RUN)
     assert lines == ["ppo.py: another process is writing to runs/run1: stop it first, or choose another --exp_name\n"]
     assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
-    ppo.lock_run(Path("runs/run1")).release()  # it may be written to again
+    ppo.lock_run(Path("runs/run1")).release()  # the lock is free again
 
 
 @pytest.mark.slow
 def test_many_environments_start(tmp_path):
-    """512 on a CPU, as a command for a GPU asks for."""
+    """A CPU can simulate 512 environments, as many as commands written for a GPU ask for."""
     flags = ("--num_envs", 512, "--num_actors", 2, "--num_steps", 2, "--total_timesteps", 1024, "--exp-name", "x",
              "--num_eval_envs", 2, "--num_eval_episodes", 2, "--no-cuda", "--no-capture_video")  # fmt: skip
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
@@ -581,8 +587,8 @@ def test_many_environments_start(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("num_envs, num_actors, signum", [(3, 2, signal.SIGTERM), (3, 1, signal.SIGKILL)])
 def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch, num_envs, num_actors, signum):
-    """Two actors, one of them with a single environment, and one actor: stopped by kill -9 or a signal, the same to the
-    last bit as never stopped."""
+    """A run stopped by SIGTERM or kill -9 and resumed ends with the same bits as one that never stopped. The first case
+    has two actors, one of them with a single environment; the second has one actor."""
     monkeypatch.chdir(tmp_path)
     flags = [*TINY, "--exact_resume", "--checkpoint_freq", 3, "--num_envs", num_envs, "--num_actors", num_actors,
              "--num_steps", 20, "--total_timesteps", 10 * 20 * num_envs, "--eval_freq", 7, "--num_eval_episodes", 3,
@@ -591,15 +597,15 @@ def test_exact_resume_with_real_tasks(start, tmp_path, monkeypatch, num_envs, nu
     process, _ = start(*flags, wait_for_rows=6)
     process.send_signal(signum)
     process.communicate(timeout=60)
-    assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "it was stopped before its end"
+    assert process.returncode == (-9 if signum == signal.SIGKILL else 143), "the run must be stopped before its end"
     assert ppo.main(["--resume", "runs/x"]) == 0
     assert same_run(tmp_path / "runs/whole", tmp_path / "runs/x")
 
 
 @pytest.mark.slow
 def test_kill_at_random_moments(tmp_path):
-    """kill -9 twenty times: at any instant there is a readable checkpoint or none yet; in the end the run is whole and
-    equal to one that was never killed."""
+    """After each of twenty kills (kill -9) last.pt is readable or does not exist yet. In the end the run equals one
+    that was never killed."""
     process = subprocess.run(
         [sys.executable, str(Path(__file__).parent / "killed_run.py")], cwd=tmp_path, capture_output=True, text=True,
         timeout=600,
@@ -612,7 +618,7 @@ def test_kill_at_random_moments(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("num_iterations, flags", [(1000, ()), (80, ("--exact_resume", "--checkpoint_freq", 2))])
 def test_memory_is_flat(tmp_path, num_iterations, flags):
-    """Over 1,000 iterations, of the main process and of the other actor; and over 40 times that scenes are rebuilt."""
+    """The main process and the other actor do not grow over 1,000 iterations, or over 40 rebuilds of the scenes."""
     flags = (*flags, "--env_id", "MS-CartpoleBalance-v1", "--env_kwargs", '{"max_episode_steps": 50}',
              "--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 2,
              "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-capture_video", "--no-cuda",

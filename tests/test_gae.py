@@ -1,4 +1,4 @@
-"""compute_gae against the definitions, written out as sums in float64."""
+"""compute_gae equals its definitions, written out as sums in float64."""
 
 import torch
 from hypothesis import given, settings
@@ -65,7 +65,7 @@ def test_equals_definition(rollout, gamma, lam, finite_horizon, rule):
     terminated, truncated = rollout["terminated"], rollout["truncated"]
     dones = terminated | truncated
     next_values = rollout["true_next_values"].clone()
-    for index in dones.nonzero().tolist():  # the rules once more, in words
+    for index in dones.nonzero().tolist():  # the rules again, written out
         t, env = index
         counts = {"always": True, "never": False, "truncated": not terminated[t, env]}[rule]
         next_values[t, env] *= counts
@@ -80,7 +80,7 @@ def test_equals_definition(rollout, gamma, lam, finite_horizon, rule):
 
 
 def test_float_dones_and_devices(device):
-    """The training loop stores dones as float32 on its device."""
+    """Boolean dones and float32 dones give the same result. The training loop stores them as float32 on its device."""
     x = torch.rand(5, 4, device=device)
     dones = torch.rand(5, 4, device=device) < 0.3
     for finite in (False, True):

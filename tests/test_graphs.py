@@ -1,6 +1,7 @@
-"""What the scripts launch as CUDA graphs gives what it gives step by step, and the host looks at no number meanwhile.
+"""Functions that the scripts launch as CUDA graphs give the same results as step by step, and do not make the host read
+a number.
 
-On the CPU the stand-in of recorded_graph.py takes the place of CUDA graphs."""
+On the CPU, recorded_graph.py stands in for CUDA graphs."""
 
 import contextlib
 import dataclasses
@@ -54,7 +55,7 @@ def close(a, b, device):
 FLAGS = [
     dict(anneal_lr=True, norm_obs=True, target_kl=0.003, update_epochs=8),
     dict(clip_vloss=True, finite_horizon_gae=True, bootstrap_at_done="truncated", norm_adv=False, num_minibatches=7),
-    # a graph freezes Python numbers: this finds a number that follows a flag of yours from iteration to iteration
+    # a graph freezes Python numbers: this case finds one that you compute from a flag and change between iterations
     {f.name: 0.9 * (f.default or 0.1) for f in dataclasses.fields(ppo.Args) if f.type in (float, Optional[float])},
 ]
 
@@ -69,7 +70,7 @@ def test_equals_step_by_step(train, with_graphs, script, device, flags):
 
 
 def test_equals_step_by_step_after_a_resume(train, with_graphs, small, device):
-    """The optimizer's tensors are loaded before anything is captured."""
+    """A resumed run loads the optimizer's tensors before it captures anything."""
     size, results = small.num_envs * small.num_steps, []
     for i, run in enumerate((train, with_graphs)):
         flags = dict(eval_freq=0, anneal_lr=True, **{} if run is with_graphs else dict(cudagraphs=False))
@@ -83,7 +84,8 @@ def test_equals_step_by_step_after_a_resume(train, with_graphs, small, device):
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [ppo])
 def test_compiled_is_near(train, script, monkeypatch):
-    """In every minibatch; the noise of actions comes from another generator then."""
+    """The compiled network is near the original in every minibatch. It draws the noise of actions from another
+    generator, so the runs differ."""
     update, compared = script.update_minibatch, []
 
     def compare(agent, optimizer, args, obs, actions, **others):
@@ -99,7 +101,7 @@ def test_compiled_is_near(train, script, monkeypatch):
 
 
 class FakeCuda:
-    """What `CudaGraph` needs of torch.cuda, on the CPU: a function may ask `wait` whether it may wait."""
+    """The parts of torch.cuda that `CudaGraph` needs, on the CPU. `wait` fails during a capture, as CUDA does."""
 
     CUDAGraph = Stream = lambda *_: SimpleNamespace(replay=lambda: None, wait_stream=lambda other: None)
     current_stream, stream = Stream, contextlib.nullcontext
@@ -139,7 +141,7 @@ def test_functions_are_captured_at_the_fourth_call(cuda, script, capsys):
 
 
 def test_an_observation_lies_where_the_graph_finds_it(cuda, device, script):
-    """Copied there at every call; the function itself is called up to the capture."""
+    """Every call copies the observation to the same place. The function itself is not called after the capture."""
     seen = []
 
     def double(obs):
@@ -170,9 +172,9 @@ for _ in range(6):
 
 
 def test_what_cannot_be_captured_ends_the_run_in_one_line(cuda, device, script):
-    """And the line says how to go on."""
+    """The line names the function, the reason, and the flag that helps."""
     message = "looks cannot be a CUDA graph, --no-cudagraphs does without: "
-    if device.type == "cuda":  # in a process of its own, whose CUDA is spoilt by it
+    if device.type == "cuda":  # in its own process, because the failed capture breaks CUDA
         code = CANNOT_BE_CAPTURED.format(script=script.__name__)
         process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
         assert process.returncode == 1 and f"RunError: {message}" in process.stderr
@@ -188,7 +190,7 @@ def test_what_cannot_be_captured_ends_the_run_in_one_line(cuda, device, script):
 
 
 class Guard:
-    """While on, the host may not look at a number."""
+    """While `on`, the host must not read a number from a tensor."""
 
     LOOKS = ("item", "tolist", "__bool__", "__int__", "__float__", "__index__", "cpu", "numpy", "nonzero")
 
@@ -199,7 +201,7 @@ class Guard:
 
     def guarded(self, name, method):
         def look(*args, **kwargs):
-            assert not self.on, f"the host looks at a number: {name}"
+            assert not self.on, f"the host reads a number: {name}"
             self.count += 1
             return method(*args, **kwargs)
 
@@ -212,14 +214,15 @@ class Guard:
 
 
 def test_the_host_looks_at_nothing_in_rollout_and_update(train, script, device, monkeypatch):
-    """From the first step of the policy to the end of the rollout, but for the environments' step (ManiSkillVectorEnv
-    asks whether an episode ended), and in an epoch of the update; between them it may, once an iteration or epoch."""
+    """The host reads no number from the first step of the policy to the end of the rollout, or in an epoch of the
+    update. The environments' step is an exception: ManiSkillVectorEnv asks whether an episode ended. Between rollouts
+    and epochs the host may read numbers."""
     guard = Guard(monkeypatch, device)
     step, rollout = script.ManiSkillVectorEnv.step, script.rollout
     guarded_calls = []
 
     def unguarded_step(self, actions):
-        was_on = guard.on  # not in evaluations
+        was_on = guard.on  # off in evaluations
         guard.set(False)
         try:
             return step(self, actions)

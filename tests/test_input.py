@@ -1,4 +1,4 @@
-"""Bad input is refused before anything is built: exit code 2, one line, nothing written. Good input runs."""
+"""Bad input is refused with exit code 2 and one line, and nothing is written. Good input runs."""
 
 import random
 import sys
@@ -86,7 +86,7 @@ def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
 
 
 def test_physx_without_its_library_is_refused(in_tmp, capsys, monkeypatch):
-    """As SAPIEN fails where the download, or the unversioned libcuda.so, is missing."""
+    """SAPIEN raises these errors if the unversioned libcuda.so or the download is missing. The line names a remedy."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch, "zeros", lambda *args, **kwargs: None)
     for error, remedy in (
@@ -129,14 +129,20 @@ def test_ray_tracing_of_a_batch_is_refused(script, in_tmp, capsys):
     assert "ray tracing needs CPU simulation" in line
 
 
-def test_driver_too_old_is_told(in_tmp, capsys, monkeypatch):
-    """With physx_cuda a refusal; else the run goes on without the GPU and says why."""
+def test_driver_too_old(in_tmp, capsys, monkeypatch):
+    """With physx_cuda, the script refuses to run and prints the reason. Otherwise it learns on the CPU."""
 
     def zeros(*args, device=None, **kwargs):
         raise RuntimeError("The NVIDIA driver on your system is too old (found version 11000).\nPlease update.")
 
     monkeypatch.setattr(torch, "zeros", zeros)
     assert "driver on your system is too old" in refused(["--sim_backend", "physx_cuda"], capsys)
+
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: path == Path("/proc/driver/nvidia") or exists(path))
+    args = ppo.parse_args([])
+    ppo.check_simulation(args)
+    assert not args.cuda and "the GPU is not used: The NVIDIA driver" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -193,8 +199,8 @@ INVALID = {
 
 @pytest.mark.slow
 def test_fuzz(in_tmp, capsys, monkeypatch):
-    """200 generated command lines: the valid ones run (tiny), those with one invalid value anywhere are refused. What
-    only building the task shows is in test_bad_input: these environments take everything."""
+    """Of 200 generated command lines, the valid ones run, and those with one invalid value are refused. test_bad_input
+    has the errors that appear only when the task is built: these environments accept everything."""
     rng = random.Random(0)
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
     monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)  # slow

@@ -1,4 +1,4 @@
-"""Several processes, started by torchrun, train together as one would with all their environments."""
+"""Several processes, started by torchrun, train together as one process would with all their environments."""
 
 import os
 import re
@@ -35,8 +35,8 @@ def launch(cwd, *arguments):
 
 
 def one_step(script, rows, rank, world_size):
-    """An agent after a step on the rows that fall to this rank, and after having seen their observations."""
-    torch.set_num_threads(1)  # another number makes other last bits
+    """Take a gradient step and update the normalization on this rank's rows; returns the state and the metrics."""
+    torch.set_num_threads(1)  # another number of threads changes the last bits
     torch.manual_seed(0)
     args = script.Args(num_minibatches=1, norm_obs=True)
     obs, space = torch.randn(rows, 3), box(3)
@@ -44,7 +44,7 @@ def one_step(script, rows, rank, world_size):
         obs = {"state": obs, "rgb": torch.randint(256, (rows, 36, 36, 3), dtype=torch.uint8)}
         space = gym.spaces.Dict(state=space, rgb=gym.spaces.Box(0, 255, (36, 36, 3), np.uint8))
     agent = script.Agent(space, box(2), args)
-    optimizer = torch.optim.SGD(agent.parameters(), lr=1.0)  # which shows the gradient itself
+    optimizer = torch.optim.SGD(agent.parameters(), lr=1.0)  # a step of this optimizer is the gradient itself
     actions, (logprobs, advantages, returns, values) = torch.randn(rows, 2), torch.randn(4, rows)
     advantages[: rows // 2] = 5 * advantages[: rows // 2] + 2  # the halves differ in mean and scale
     share = slice(rank * rows // world_size, (rank + 1) * rows // world_size)
@@ -60,7 +60,7 @@ def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
 
-    # the step is that of all rows
+    # the step equals that of one process on all rows
     for script in (ppo, ppo_rgb):
         expected = one_step(script, 40, 0, 1)
         for rank in (0, 1):
@@ -68,21 +68,21 @@ def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
             for key, value in expected.items():
                 torch.testing.assert_close(step[key], value, rtol=1e-4, atol=1e-5)
 
-    # a run ends with the same weights in both, of episodes that differ
+    # both processes end with the same weights, although their episodes differ
     ranks = [torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1)]
     assert all(torch.equal(ranks[0]["agent"][k], ranks[1]["agent"][k]) for k in ranks[0]["agent"])
     assert not torch.equal(ranks[0]["actions"], ranks[1]["actions"])
 
-    # one folder, written by the first
+    # only the first process writes the run folder
     assert sorted(path.name.split(".out")[0] for path in (tmp_path / "runs/x").iterdir()) == [
         ".lock", "args.json", "best.pt", "events", "last.pt", "learning_curve.png", "metrics.jsonl"
     ]  # fmt: skip
     rows = read_metrics(tmp_path / "runs/x")
     assert [row["global_step"] for row in rows if row["kind"] == "train"] == [320, 640, 960]
-    assert [row["num_episodes"] for row in rows if row["kind"] == "eval"] == [6, 6, 6], "at least 5, 3 each"
+    assert [row["num_episodes"] for row in rows if row["kind"] == "eval"] == [6, 6, 6], "at least 5: 3 in each process"
     assert output.count("writing to") == 1
 
-    # what one process cannot go on with
+    # one process alone cannot resume this run
     monkeypatch.chdir(tmp_path)
     assert "torchrun --nproc_per_node=2" in refused(["--resume", "runs/x", "--total_timesteps", 2000], capsys)
 
@@ -122,24 +122,24 @@ def test_stopped_resumed_and_killed(tmp_path):
     assert ppo.load_checkpoint(folder / "last.pt")["global_step"] >= steps[-1] - 320
 
 
-if __name__ == "__main__":  # in each of the processes
+if __name__ == "__main__":  # torchrun runs this in each process
     import batched_env
 
     Path(f"pid{ppo.RANK}").write_text(str(os.getpid()))
     agents, make_agent, actions = [], ppo.Agent, []
 
-    def agent_that_is_kept(*arguments):
+    def kept_agent(*arguments):
         agents.append(make_agent(*arguments))
         return agents[-1]
 
-    def envs_that_tell(*arguments, **kwargs):
+    def envs_that_record(*arguments, **kwargs):
         envs = batched_env.make_envs(*arguments, **kwargs)
         step = envs.step
         envs.step = lambda action: actions.append(action) or step(action)
         return envs
 
-    ppo.Agent, ppo.make_envs = agent_that_is_kept, envs_that_tell
-    torch.distributed.destroy_process_group = lambda: None  # it is needed once more
+    ppo.Agent, ppo.make_envs = kept_agent, envs_that_record
+    torch.distributed.destroy_process_group = lambda: None  # one_step needs the process group
     code = ppo.main(sys.argv[1:])
     ppo.Agent = make_agent
     for script in (ppo, ppo_rgb):

@@ -3,10 +3,14 @@
 import json
 import shlex
 import shutil
+from dataclasses import asdict
 
 import pytest
 from benchmarks import results
 from conftest import ROOT, read_metrics
+
+import ppo
+import ppo_rgb
 
 FLAGS = "--total_timesteps 640 --num_envs 4 --num_steps 40 --eval_freq 2 --num_eval_episodes 2 --num_actors 1"
 
@@ -80,10 +84,16 @@ def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
     assert len(bold) == 2 and "`push_cube_cpu`" in bold[0] and "0.90, 0.95, 0.91" in bold[0] and "810" in bold[1]
 
 
-def test_the_table_names_recipes_that_exist():
-    """And holds each row once."""
+def test_rows_are_of_todays_recipes(run_recipe):
+    """The flags of each row in the table are those that its recipe and the defaults give today."""
     rows = results.read_rows(results.FOLDER / "results.jsonl")
     keys = [(row["recipe"], row["further_flags"], row["seed"]) for row in rows]
-    assert len(set(keys)) == len(keys) and {recipe for recipe, _, _ in keys} <= set(results.find_recipes())
+    assert len(set(keys)) == len(keys), "a row must not be there twice"
+    of_the_run = {"seed", "exp_name", "capture_video", "resume"}
+    of_the_machine = {"num_envs", "num_eval_envs", "num_steps", "num_actors"}
     for row in rows:
+        (script, *flags), _ = run_recipe(row["recipe"], *shlex.split(row["further_flags"]))
+        today = asdict({"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script].parse_args(flags))
+        for name in today.keys() - of_the_run - of_the_machine:
+            assert row["flags"][name] == today[name], (row["recipe"], name)
         assert row["steps"] == row["curve"][-1][0] and row["curve"][0][0] == 0

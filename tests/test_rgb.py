@@ -1,4 +1,4 @@
-"""ppo_rgb.py: what it sees, what that takes, what it learns from. What it shares with ppo.py is tested there."""
+"""ppo_rgb.py: its observations, their memory, and training from images. Tests of ppo.py cover the code in common."""
 
 import json
 import subprocess
@@ -35,7 +35,7 @@ def small():
     return SMALL_IMAGES
 
 
-# ----- what it sees ---------------------------------------------------------------------------------------------------
+# ----- observations ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.render
@@ -48,7 +48,7 @@ def small():
     ],
 )
 def test_observations_are_maniskills(env_id, obs_mode, flags):
-    """Shapes, dtypes and values against ManiSkill's own, for every texture and two cameras."""
+    """Shapes, dtypes and values equal ManiSkill's own, for every texture and for two cameras."""
     args = replace(ARGS, env_id=env_id, obs_mode=obs_mode, **flags)
     env = ppo_rgb.make_env(args, 1)
     sensors = dict(shader_pack=args.shader, width=args.camera_width or 128, height=args.camera_height or 128)
@@ -66,7 +66,7 @@ def test_observations_are_maniskills(env_id, obs_mode, flags):
         single = env.get_wrapper_attr("single_observation_space")
         for k in obs_mode.split("+"):
             images = torch.cat([camera[k] for camera in cameras], dim=-1)
-            if k == "segmentation":  # the default shader's 64 bits would be six too many bytes
+            if k == "segmentation":  # the default shader gives 8 bytes, and 2 are enough
                 images = images.short()
             assert obs[k].dtype == images.dtype and single[k].shape == tuple(obs[k].shape[1:])
             assert torch.equal(obs[k][..., -images.shape[-1] :], images), k
@@ -96,7 +96,7 @@ def test_view():
         image = env.render()
         assert image.dtype == torch.uint8 and image.shape == (1, height, width, 3), "multiples of 16"
     assert all(view.float().std() > 0 for view in image[0, :, :40].split(40))
-    env.unwrapped.render_rgb_array = lambda: None  # a task without a camera for people
+    env.unwrapped.render_rgb_array = lambda: None  # a task without a human render camera
     env.unwrapped.render_mode = "all"
     assert torch.equal(env.render(), image)
     env.close()
@@ -105,7 +105,8 @@ def test_view():
 @pytest.mark.render
 @pytest.mark.parametrize("env_id, robot", [("MS-CartpoleBalance-v1", None), ("PickCube-v1", "panda_wristcam")])
 def test_a_batch_sees_what_single_environments_see(env_id, robot):
-    """From equal states on, frame stacks and an episode that begins in one of them included; the goal stays hidden."""
+    """From equal states on, both see the same, even with frame stacks and a reset of one environment. The goal is
+    hidden from both."""
     args = replace(
         ARGS, env_id=env_id, robot_uids=robot, obs_mode="rgb+depth+segmentation", frame_stack=3, camera_width=48,
         camera_height=48,
@@ -128,7 +129,7 @@ def test_a_batch_sees_what_single_environments_see(env_id, robot):
                 assert torch.equal(obs[k], rows)
             elif k == "state":
                 torch.testing.assert_close(obs[k], rows, rtol=0, atol=1e-4)
-            else:  # the states drift apart by a millionth, and a pixel at an edge falls to the other side
+            else:  # the states drift apart by a millionth, so pixels at edges may differ
                 assert obs[k].shape == rows.shape and (obs[k] != rows).float().mean() < 0.01
         actions = torch.rand(3, *batch.get_wrapper_attr("single_action_space").shape) * 2 - 1
         obs = batch.step(actions)[0]
@@ -137,19 +138,19 @@ def test_a_batch_sees_what_single_environments_see(env_id, robot):
             obs, _ = batch.reset(options=dict(env_idx=torch.tensor([1])))
             expected[1] = start(1)
             for i, frames in enumerate(obs["rgb"].chunk(3, dim=-1)[0] != obs["rgb"].chunk(3, dim=-1)[2]):
-                assert bool(frames.any()) == (i != 1), "an episode begins with its first frame repeated"
+                assert bool(frames.any()) == (i != 1), "an episode must begin with its first frame repeated"
     for env in (batch, *singles):
         env.close()
 
 
 def test_frame_stack_with_partial_resets(device):
-    """Against one queue for each environment, filled with the first frame of its episode."""
+    """Stacks equal one queue for each environment. A queue starts filled with the first frame of its episode."""
     args = replace(SMALL_IMAGES, obs_mode="rgb+segmentation", frame_stack=3)
     env = ppo_rgb.ImageObservations(batched_env.BatchedReachImages(4, device), args)
     plain = batched_env.BatchedReachImages(4, device)
     queues = [None] * 4
 
-    def frames(raw, fresh=None):  # fresh: whose episodes a reset began; the others stay as they were
+    def frames(raw, fresh=None):  # fresh: the environments that were reset; the other queues stay
         flat = {k: torch.cat([c[k] for c in raw["sensor_data"].values()], -1) for k in ("rgb", "segmentation")}
         flat["state"] = raw["agent"]["position"]
         for i in range(4):
@@ -191,10 +192,10 @@ def test_textures_become_numbers_of_like_scale():
     image = encoder.to_image(obs)
     assert image.shape == (1, 3 + 1 + 3 + 3 + 3 + 3, 36, 36) and image.dtype == torch.float32
     assert image[0, :3, 0, 0].tolist() == [0.5] * 3 and image[0, :3, 5, 5].tolist() == [-0.5] * 3
-    assert image[0, 3, 0, :3].tolist() == [0, 0.5, 0.25], "nothing is far away"
-    assert torch.equal(encoder.to_image(dict(reversed(obs.items()))), image), "whatever the order of the dict"
+    assert image[0, 3, 0, :3].tolist() == [0, 0.5, 0.25], "depth 0 must count as far away"
+    assert torch.equal(encoder.to_image(dict(reversed(obs.items()))), image), "the order of the dict must not matter"
     a, b, c = image[0, 4:7, 0, :3].T
-    assert torch.equal(a, c) and not torch.equal(a, b), "equal ids look alike, others not"
+    assert torch.equal(a, c) and not torch.equal(a, b), "equal ids must look alike, other ids must not"
     assert image[0, 7:10, 0, 0].tolist() == [-2, 0, 0.5]
     assert (image[0, 10:13] == -1).all() and (image[0, 13:] == -0.5).all()
 
@@ -247,7 +248,7 @@ def test_mixed_precision_is_near(device):
 
 
 def test_random_shift(device):
-    """Against padding by hand: each image moves as a whole, all textures together, borders repeated."""
+    """Shifts equal padding by hand: each image moves as a whole, all textures together, and borders are repeated."""
     torch.manual_seed(0)
     rgb = torch.randint(0, 255, (50, 9, 11, 3), dtype=torch.uint8, device=device)
     obs = {"state": torch.randn(50, 2, device=device), "rgb": rgb, "depth": rgb[..., :1].short()}
@@ -280,8 +281,11 @@ def test_all_options_train(train):
 
 @pytest.mark.slow
 def test_learns_from_images(train):
-    """The goal is on the images alone, and as wide as a pixel: the mean action often stops just next to it, so that 32
-    evaluation episodes differ by 0.1 with the rounding of another number of threads. Training ends hundreds."""
+    """The policy learns to reach a goal that only the images show.
+
+    The goal region is less than two pixels wide, and the mean action often stops just next to it. Over 32 evaluation
+    episodes, another number of threads, and so other rounding, changes the success rate by 0.1. Training's rate is
+    over hundreds of episodes."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
     metrics, *_ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
@@ -339,7 +343,7 @@ print(peak, args.batch_size * (36 * 36 * 2 * (3 * 1 + 1 * 2) + 2 * 4))  # two ca
 
 @pytest.mark.slow
 def test_the_buffers_take_what_is_said_and_are_not_copied(tmp_path):
-    """Peak memory of runs with a short and a long rollout."""
+    """A longer rollout takes as much more peak memory as its observations need."""
     peaks, sizes = [], []
     for num_steps in (10, 130):
         (tmp_path / str(num_steps)).mkdir()
@@ -384,7 +388,7 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
     assert len(images) >= 8 and images.shape[1:] == (512, 768, 3), "the scene, and two views of half its height"
     scene, rgb, depth = images[:, :, :512], images[:, :256, 512:], images[:, 256:, 512:]
     assert scene.std() > 2 and rgb.std() > 2 and depth.std() > 0.5, "the wall is far and the cart hardly nearer"
-    # evaluation needs the checkpoint alone: the cameras are its own
+    # evaluation needs only the checkpoint: it contains the flags of the cameras
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     flags = ("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 1, "--num_eval_envs", 1)
@@ -395,7 +399,7 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
 
 @pytest.mark.render
 def test_two_actors_train_from_images(tmp_path):
-    """As a command; each of two processes simulates three environments, and writes what they see for the learner."""
+    """The command trains with two processes: each simulates three environments and writes images for the learner."""
     flags = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--frame_stack", 2,
              "--num_envs", 6, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 10,
              "--total_timesteps", 180, "--num_minibatches", 2, "--eval_freq", 2, "--no-capture_video", "--no-cuda",

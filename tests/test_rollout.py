@@ -1,7 +1,7 @@
-"""The rollout against a replay of the same episodes in plain Python and float64.
+"""The rollout equals a replay of the same episodes in plain Python and float64.
 
-A spy between ManiSkillVectorEnv and the task keeps what the simulation got and gave. The replay calculates from that
-alone what the storage must hold: it shares no code with ppo.py."""
+A spy between ManiSkillVectorEnv and the task records the inputs and outputs of the simulation. From these alone the
+replay computes what the storage must hold: it shares no code with ppo.py."""
 
 import copy
 import math
@@ -19,14 +19,14 @@ import ppo
 
 
 class Reach(BatchedReach):
-    """Reach with episodes that soon end in every way, numbers of its own in its infos, and uneven action bounds."""
+    """BatchedReach with short episodes that end in every way, its own numbers in infos, and uneven action bounds."""
 
     max_episode_steps = 5
 
     def __init__(self, num_envs, seed=0):
         super().__init__(num_envs, "cpu")
         self.single_action_space = gym.spaces.Box(np.float32([-0.9, -0.5]), np.float32([0.4, 0.8]))
-        self.generator = np.random.default_rng(seed)  # resets leave torch's generator to the actions
+        self.generator = np.random.default_rng(seed)  # only actions draw from torch's generator, not resets
 
     def info(self):
         distance = (self.state[:, :2] - self.state[:, 2:]).norm(dim=1)
@@ -80,7 +80,7 @@ def make_agent(obs_space, action_space, args):
 
 
 class Network:
-    """The agent once more, from its parameters and in float64."""
+    """Computes the agent's outputs again, from its parameters and in float64."""
 
     def __init__(self, agent):
         self.parameters = {k: v.detach().double().numpy().copy() for k, v in agent.state_dict().items()}
@@ -118,7 +118,7 @@ def fresh_episode():
 
 
 def replay(network, args, first_obs, steps, episodes):
-    """What a rollout must store, sum up and return. `episodes` holds those that are under way, and is changed."""
+    """Returns what a rollout must store, sum up and return. `episodes` holds the unfinished episodes and is updated."""
     num_envs = len(first_obs)
     names = ("obs", "rewards", "dones", "values", "next_values", "sent")
     wanted = {name: [[None] * num_envs for _ in steps] for name in names}
@@ -195,7 +195,7 @@ def gae_of_episodes(wanted, gamma, lam, finite_horizon):
 
 
 def compare(agent, args, spy, first_obs, storage, sums, last_obs, episodes):
-    """One rollout with its replay; returns how often episodes ended in which way, and the replay."""
+    """Compare a rollout with its replay; returns how many episodes ended in each way, and the replay."""
     network = Network(agent)
     wanted, wanted_sums, ends, wanted_last_obs = replay(network, args, first_obs, spy.steps, episodes)
     got = {k: v.double().numpy() for k, v in storage.items()}
@@ -206,7 +206,7 @@ def compare(agent, args, spy, first_obs, storage, sums, last_obs, episodes):
     np.testing.assert_allclose(got["values"], wanted["values"], **close)
     np.testing.assert_allclose(got["next_values"], wanted["next_values"], **close)
     np.testing.assert_array_equal(last_obs, wanted_last_obs)
-    # the simulation gets the clipped action; what is learned from is the sample and its own density
+    # the simulation gets the clipped action; the update learns from the sample itself and its density
     space = spy.get_wrapper_attr("single_action_space")
     np.testing.assert_array_equal(np.clip(got["actions"], space.low, space.high), wanted["sent"])
     assert (got["actions"] != wanted["sent"]).any(), "some samples must lie outside the bounds"
@@ -231,7 +231,7 @@ ARGS = replace(SMALL, num_envs=12, num_steps=20, gamma=0.9, gae_lambda=0.8, rewa
 @pytest.mark.parametrize("partial_reset", [True, False])
 @pytest.mark.parametrize("rule", ["always", "truncated", "never"])
 def test_equals_replay(rule, partial_reset, norm_obs):
-    """Two rollouts in a row: the second goes on with the episodes of the first."""
+    """Two rollouts in a row equal their replays. The second continues the episodes of the first."""
     args = replace(ARGS, bootstrap_at_done=rule, partial_reset=partial_reset, norm_obs=norm_obs)
     args.shared_features = norm_obs and partial_reset
     spy = Spy(Reach(args.num_envs))
@@ -248,7 +248,7 @@ def test_equals_replay(rule, partial_reset, norm_obs):
         ends, wanted = compare(agent, args, spy, first_obs, storage, sums, obs, episodes)
         all_ends += ends
         ended_by += Counter({k: v.item() for k, v in sums.items() if k in ("success_at_end", "fail_at_end")})
-        # each action is the policy's mean and deviation with fresh noise
+        # each action is the policy's mean plus its standard deviation times fresh noise
         torch.manual_seed(number)
         noise = torch.stack([torch.randn(args.num_envs, 2) for _ in range(args.num_steps)]).double().numpy()
         actions = network.mean(wanted["obs"]) + np.exp(network.logstd) * noise
@@ -256,12 +256,12 @@ def test_equals_replay(rule, partial_reset, norm_obs):
         if norm_obs:
             normalized = abs(network.normalize(wanted["obs"]))
             assert normalized.max() == 10 and normalized.min() < 1
-    assert set(all_ends) == ({"early", "late", "both"} if partial_reset else {"late"}), "episodes end in every way"
+    assert set(all_ends) == ({"early", "late", "both"} if partial_reset else {"late"}), "episodes must end in every way"
     assert all(ended_by[k] >= 2 for k in ("success_at_end", "fail_at_end"))
 
 
 def test_rollout_without_an_end():
-    """Values follow one another, and there is nothing to sum up."""
+    """Each next value is the value of the following step, and there is nothing to sum up."""
     args = replace(ARGS, num_steps=3, partial_reset=False)
     spy = Spy(Reach(args.num_envs))
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=True, record_metrics=True)
@@ -306,13 +306,13 @@ TWO = replace(PUSH, num_envs=4, num_actors=2, num_eval_envs=4, env_kwargs="{}")
 
 
 def noise_alone(obs):
-    """Stands in for the policy: what is stored as the action is the noise itself."""
+    """Stands in for the policy: the stored actions are the noise itself."""
     return torch.randn(len(obs), 8), torch.zeros(len(obs)), None, torch.zeros(len(obs))
 
 
 @pytest.fixture(scope="module")
 def actors():
-    """Both actors of a run, and a spy on the seeds that each gives its environments."""
+    """Both actors of a run. Each records the seeds that it gives its environments."""
     actors = [ppo.Actor(TWO, index) for index in (0, 1)]
     for actor in actors:
         actor.seeds, reset = [], actor.envs.reset
@@ -358,22 +358,22 @@ def test_noise_follows_from_seed_iteration_and_actor(actors):
     assert all(map(torch.equal, usual, again))
     others = [noise_of(actor, 4, seed=12) for actor in actors] + [noise_of(actor, 5) for actor in actors]
     numbers = torch.cat([x.flatten() for x in usual + others])
-    assert len(numbers.unique()) == len(numbers), "no number is drawn twice"
+    assert len(numbers.unique()) == len(numbers), "no number may be drawn twice"
 
 
-def test_episodes_start_anew_from_seeds_of_their_own_where_asked(actors):
-    """Training's seeds are no evaluation's, and differ between environments, iterations and seeds of runs."""
+def test_restarted_episodes_have_their_own_seeds(actors):
+    """Seeds of training differ from those of evaluation, and between environments, iterations and seeds of runs."""
     all_seeds = []
     for actor in actors:
         actor.seeds.clear()
         for iteration, seed in ((0, 11), (3, 11), (0, 12)):
             noise_of(actor, iteration, seed, restart=True)
-        assert len(actor.seeds) == 3, "no episode has ended, so nothing else was reset"
+        assert len(actor.seeds) == 3, "no episode has ended, so nothing else may be reset"
         all_seeds += sum(actor.seeds, [])
         noise_of(actor, 0, restart=True)
         assert actor.seeds.pop() == actor.seeds[0]
         noise_of(actor, 1)
-        assert len(actor.seeds) == 3, "episodes go on in the next iteration"
+        assert len(actor.seeds) == 3, "episodes must go on in the next iteration"
     assert len(set(all_seeds)) == len(all_seeds) == 12
     assert all(2**31 <= seed < 2**32 for seed in all_seeds)
 
@@ -406,7 +406,8 @@ def sizes_of(args, index):
 
 
 def test_objects_follow_from_the_seed_and_the_actor():
-    """A task that varies its objects builds others for each actor and each seed; evaluation's have a seed apart."""
+    """A task that varies its objects builds others for each actor and each seed. The objects of evaluation follow from
+    eval_seed instead."""
     (training, evaluation), (of_actor_1, evaluation_1) = sizes_of(PEG, 0), sizes_of(PEG, 1)
     of_seed_12, same_evaluation = sizes_of(replace(PEG, seed=12), 0)
     same, other_evaluation = sizes_of(replace(PEG, eval_seed=50), 0)
@@ -416,7 +417,7 @@ def test_objects_follow_from_the_seed_and_the_actor():
 
 
 def test_evaluation_builds_the_objects_of_its_seeds():
-    """Those of episode k are those of ManiSkill's single environment with seed eval_seed + k."""
+    """Episode k has the objects of ManiSkill's single environment with seed eval_seed + k."""
     args = replace(PEG, eval_seed=7, num_actors=1, env_kwargs='{"max_episode_steps": 1}')
     envs = ppo.make_envs(args, 2, 1234, evaluation=True)
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)

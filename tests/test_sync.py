@@ -1,4 +1,4 @@
-"""ppo.py and ppo_rgb.py stand alone, so that each can be copied: what both need is in both, and stays the same."""
+"""ppo.py and ppo_rgb.py stand alone, so that each can be copied. Code that both need is in both, and must be equal."""
 
 import ast
 import difflib
@@ -9,7 +9,7 @@ from conftest import ROOT
 
 import ppo_rgb
 
-# what differs between the state and the images; everything else must not
+# what differs between the state and the images; everything else must be equal
 DIFFERENT = {
     "EnvironmentArgs", "PPOArgs", "make_env", "Agent", "check_observations", "check_task",
     "load_agent", "rollout", "train",
@@ -76,7 +76,7 @@ def flags(name):
 
 
 def test_flags_that_both_have_are_the_same():
-    """And in the same order, but for what images change."""
+    """Shared flags have the same order, types, defaults and help, except where images require something else."""
     a, b = flags("ppo.py"), flags("ppo_rgb.py")
     assert [k for k in a if k in b] == [k for k in b if k in a] and b.keys() == ppo_rgb.Args.__dataclass_fields__.keys()
     assert a.keys() - b.keys() == {"shared_features"}

@@ -1,9 +1,9 @@
-"""Does a task start its episodes as ManiSkill's batches need it? For the examples, some of ManiSkill's, and yours:
+"""Does a task start its episodes as ManiSkill's batches require? For the examples, tasks of ManiSkill, and yours:
 
     pytest PATH/TO/tests/test_task.py --env_id my_module:MyTask-v1
 
-Run it from the folder of your module; it needs no plugin of pytest. The batch is simulated on the CPU, and on
-`physx_cuda` if there is one; the summary says where.
+Run it from the folder of your module. It needs no plugin of pytest. It simulates a batch on the CPU and, if there is a
+GPU, on `physx_cuda`. The summary reports where the checks ran.
 """
 
 import os
@@ -21,7 +21,7 @@ import mani_skill.envs  # noqa: F401
 from mani_skill.utils import common
 from mani_skill.utils.structs import Pose
 
-sys.path.insert(0, os.getcwd())  # where your module lies
+sys.path.insert(0, os.getcwd())  # the folder of your module
 NUM_ENVS = 5
 EXAMPLES = [
     "examples.push_to_goal:PushToGoal-v1",
@@ -46,7 +46,7 @@ def sim_backend(request):
     if request.param == "physx_cuda" and not (
         torch.cuda.is_available() and [*Path.home().glob(".sapien/physx/*/libPhysX*")]
     ):
-        pytest.skip("needs a GPU, and PhysX's library for it, which SAPIEN fetches when it first simulates there")
+        pytest.skip("needs a GPU and PhysX's GPU library (SAPIEN downloads it when it first simulates on a GPU)")
     return request.param
 
 
@@ -58,11 +58,11 @@ def envs(env_id, sim_backend):
     env.close()
 
 
-# ----- what is looked at ----------------------------------------------------------------------------------------------
+# ----- what the checks compare ----------------------------------------------------------------------------------------
 
 
 def everything(env):
-    """What an episode is made of, by name: tensors (num_envs, ...), and the task's other tensors."""
+    """Returns what an episode is made of, by name: tensors (num_envs, ...), and the task's other tensors."""
     base, parts = env.unwrapped, {}
     for name, actor in {**base.scene.actors, **base.scene.actor_views}.items():
         if len(actor._objs) == base.num_envs and actor.px_body_type != "static":
@@ -84,18 +84,18 @@ def everything(env):
                 collect(f"{name}[{k!r}]", v)
 
     for name, value in vars(base).items():
-        if name not in ("_last_obs", "_init_raw_obs", "_init_raw_state", "_elapsed_steps"):  # ManiSkill's books
+        if name not in ("_last_obs", "_init_raw_obs", "_init_raw_state", "_elapsed_steps"):  # ManiSkill's bookkeeping
             collect(name, value)
     return {name: value.clone() for name, value in parts.items()}
 
 
 def rows_of(env, parts):
-    """Those of `parts` that have a row for each environment."""
+    """Returns those of `parts` that have a row for each environment."""
     return {k: v for k, v in parts.items() if v.ndim and len(v) == env.unwrapped.num_envs}
 
 
 def play(env, steps, seed=0):
-    """Random actions; returns what the last of them gave, and it."""
+    """Take random actions; returns the result of the last one, and that action."""
     env.action_space.seed(seed)
     for _ in range(steps):
         action = env.action_space.sample()
@@ -113,7 +113,7 @@ def first_difference(a, b, rows=slice(None)):
 
 
 def placed(parts):
-    """What _initialize_episode decides, ManiSkill not."""
+    """Returns the parts that _initialize_episode decides, without those that ManiSkill decides."""
     return {k: v for k, v in parts.items() if k.startswith(("pose", "joint positions", "attribute"))}
 
 
@@ -146,7 +146,7 @@ def reset_some(env, env_idx, **options):
 
 
 def check_observations(env):
-    """Of the declared space, and finite."""
+    """Observations have the declared shape and are finite."""
     space = env.get_wrapper_attr("single_observation_space")
     obs, _ = env.reset(seed=seeds(0))
     for step in range(10):
@@ -156,7 +156,7 @@ def check_observations(env):
 
 
 def check_seeds(env):
-    """The same seeds give the same episodes, others give others, in each environment its own."""
+    """The same seeds give the same episodes, and other seeds give others. Each environment has its own episode."""
     of_episodes = lambda: {k: v for k, v in rows_of(env, everything(env)).items() if v.is_floating_point()}
     env.reset(seed=seeds(5))
     first = of_episodes()
@@ -200,14 +200,14 @@ def check_everything_is_initialised(env):
 
 
 def check_partial_reset(env):
-    """Touches the environments of env_idx, and no other."""
+    """A partial reset changes the environments of env_idx, and no others."""
     env.reset(seed=seeds(5))
     for env_idx in ([1, 3], [2], [0], [0, 1, 2]):
         play(env, 4)
         before = everything(env)
         reset_some(env, env_idx)
         after, others = everything(env), [i for i in range(NUM_ENVS) if i not in env_idx]
-        exact = ppo.is_batch(env.unwrapped.scene)  # on the CPU; a GPU may compute other last bits
+        exact = ppo.is_batch(env.unwrapped.scene)  # exact on the CPU; on a GPU the last bits may differ
         for name in rows_of(env, before):
             assert before[name].shape == after[name].shape, OWN_TENSOR.format(
                 name.removeprefix("attribute "), len(after[name]), env_idx
@@ -220,7 +220,7 @@ def check_partial_reset(env):
 
 
 def check_overlap(env, resets=1000, tolerance=2e-3):
-    """No free object starts inside another, by PhysX's own contacts; only on the CPU."""
+    """By PhysX's own contacts, no free object starts inside another (CPU only). Few episodes start in success."""
     _, info = env.reset(seed=seeds(10_000))
     solved = 0
     for k in range(resets // NUM_ENVS):
@@ -243,7 +243,7 @@ def check_overlap(env, resets=1000, tolerance=2e-3):
 
 
 def check_options(env):
-    """What is given to reset reaches _initialize_episode."""
+    """Options of reset reach _initialize_episode."""
     seen, initialize = [], env.unwrapped._initialize_episode
 
     def spy(env_idx, options):
@@ -259,7 +259,7 @@ def check_options(env):
 
 
 def check_restoring_states(env):
-    """reset_to_env_states gives back exactly what was, without _initialize_episode."""
+    """reset_to_env_states restores the states of all or of some environments, without _initialize_episode."""
     env.reset(seed=seeds(5))
     play(env, 5)
 
@@ -291,8 +291,8 @@ def check_restoring_states(env):
 
 
 def check_rewards(env_id, sim_backend, steps=60):
-    """Normalised dense rewards are within [0, 1], in success too, dense ones bounded; random actions do not always
-    succeed."""
+    """Normalised dense rewards are within [0, 1], in success as well, and dense ones are bounded. Random actions do not
+    succeed everywhere."""
     modes = ppo.find_task(env_id).cls.SUPPORTED_REWARD_MODES
     for mode in [mode for mode in ("normalized_dense", "dense") if mode in modes]:
         env = make(env_id, sim_backend, num_envs=NUM_ENVS, reward_mode=mode)
@@ -305,16 +305,16 @@ def check_rewards(env_id, sim_backend, steps=60):
                 action = common.to_tensor(action, device=obs.device)
                 won = env.unwrapped.get_reward(obs=obs, action=action, info=won)
                 reward = torch.cat([reward, won])
-            assert torch.isfinite(obs).all() and torch.isfinite(reward).all(), "random actions give what is not finite"
+            assert torch.isfinite(obs).all() and torch.isfinite(reward).all(), "observation or reward not finite"
             low, high = (-1e-5, 1 + 1e-5) if mode == "normalized_dense" else (-1e3, 1e3)
             assert ((reward >= low) & (reward <= high)).all(), f"{mode} reward {reward.tolist()}"
             succeeded |= info.get("success", torch.zeros_like(succeeded)).cpu()
         env.close()
-        assert not succeeded.all(), "random actions succeed everywhere: what is success?"
+        assert not succeeded.all(), "random actions succeed in all environments: check `success`"
 
 
 def check_autoreset(env_id, sim_backend):
-    """Where an episode ended, the final observation is not the first of the next one."""
+    """When an episode ends, its final observation is not the first one of the next episode."""
     env = make(env_id, sim_backend, num_envs=NUM_ENVS, max_episode_steps=6)
     envs = ppo.ManiSkillVectorEnv(env, record_metrics=True)
     envs.reset(seed=seeds(3))
@@ -359,7 +359,7 @@ def test_partial_reset(envs):
 
 def test_no_overlap(envs, env_id, request):
     if not ppo.is_batch(envs.unwrapped.scene):
-        pytest.skip("contacts are asked of the simulation on the CPU")
+        pytest.skip("only CPU simulation reports the contacts")
     check_overlap(envs, resets=1000 if "examples" in env_id or request.config.getoption("--env_id") else 250)
 
 

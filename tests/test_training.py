@@ -1,5 +1,5 @@
-"""The training loop on a torch-native batched environment inside the real ManiSkillVectorEnv: the path that GPU
-simulation takes, on whatever device there is."""
+"""The training loop on a torch-native batched environment inside the real ManiSkillVectorEnv. GPU simulation takes the
+same path. These tests run on the CPU and, if there is one, on a GPU."""
 
 import contextlib
 import json
@@ -33,7 +33,8 @@ def test_learns(train, flags, seed):
 
 
 def test_evaluation_schedule_and_no_effect_on_training(train):
-    """Before training, every eval_freq iterations, after the last: and the weights do not depend on it."""
+    """Evaluations run before training, every eval_freq iterations, and after the last one. The weights do not depend on
+    them."""
     runs = {freq: train(eval_freq=freq, num_eval_episodes=16 + freq) for freq in (0, 1, 3)}
     steps = {f: [row["global_step"] // 320 for row in m if row["kind"] == "eval"] for f, (m, *_) in runs.items()}
     assert steps == {0: [0, 4], 1: [0, 1, 2, 3, 4], 3: [0, 3, 4]}
@@ -48,7 +49,7 @@ def test_same_seed_same_weights_other_seed_others(train):
 
 
 def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
-    """The same episodes from any number of environments, a last round that is not full included."""
+    """Any number of environments plays the same episodes, even if the last round is not full."""
     torch.manual_seed(0)
     agent = ppo.Agent(box(4), ACTIONS, SMALL).to(device)
     agent.actor_mean[-1].weight.data *= 100
@@ -66,7 +67,7 @@ def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
 
 
 def test_evaluation_with_early_ends(train, device):
-    """eval_partial_reset: an episode counts up to its first end."""
+    """With eval_partial_reset, an episode counts up to its first success."""
     agent = ppo.Agent(box(4), ACTIONS, SMALL).to(device)
     agent.get_action = lambda obs: ((obs[:, 2:] - obs[:, :2]) / 0.3).clamp(-1, 1)  # straight to the goal
     envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), 16, 0, evaluation=True, device=device)
@@ -78,7 +79,7 @@ def test_evaluation_with_early_ends(train, device):
 
 
 def test_metrics_are_means_over_finished_episodes_and_the_whole_update(train, monkeypatch):
-    """Against what the environments and the updates returned, kept aside."""
+    """Logged metrics equal the means of what the environments and the updates returned."""
     finished, updates, counted = [], [], []
     step, update = ppo.ManiSkillVectorEnv.step, ppo.update_minibatch
 
@@ -96,7 +97,7 @@ def test_metrics_are_means_over_finished_episodes_and_the_whole_update(train, mo
 
     monkeypatch.setattr(batched_env.ManiSkillVectorEnv, "step", spy_step)
     monkeypatch.setattr(ppo, "update_minibatch", spy_update)
-    # 960 / 7 leaves a remainder: all minibatches are equally large all the same
+    # 960 / 7 leaves a remainder, but all minibatches have the same size
     metrics, *_ = train(total_timesteps=960, num_steps=30, num_minibatches=7, update_epochs=2, reward_scale=0.1)
     (row,) = [row for row in metrics if row["kind"] == "train"]
     assert row["return"] == pytest.approx(sum(finished) / len(finished), rel=1e-4)
@@ -167,7 +168,8 @@ def test_anneal_lr_reaches_zero(train):
 
 
 def test_a_real_task(in_tmp):
-    """Of ManiSkill, in a batch in this process: the episodes that end are counted, and evaluations are written down."""
+    """A run on a task of ManiSkill, in a batch in this process, counts finished episodes and writes trajectories of its
+    evaluations."""
     args = ppo.Args(
         sim_backend="physx_cpu", num_envs=4, num_actors=1, num_steps=15, total_timesteps=120, num_minibatches=4,
         num_eval_envs=3, num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True, cuda=False,
@@ -180,13 +182,13 @@ def test_a_real_task(in_tmp):
     assert all(row["episode_len"] == 10 and math.isfinite(row["return"]) for row in rows)
     episodes = json.loads((in_tmp / "runs/x/videos/trajectory_0.json").read_text())["episodes"]
     assert len(episodes) == 12 and all(e["elapsed_steps"] == 10 for e in episodes), (
-        "two evaluations of two rounds of three"
+        "two evaluations, each of two rounds of three episodes"
     )
 
 
 @pytest.mark.gpu
 def test_cpu_simulation_feeds_a_gpu_learner(in_tmp, monkeypatch):
-    """The agent's copy on the CPU acts: the first rollout is that of a CPU learner, and the second one follows the
+    """A copy of the agent on the CPU acts. The first rollout equals that of a CPU learner, and the second uses the
     weights that the GPU has learned."""
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
     rollout, copies = ppo.rollout, []

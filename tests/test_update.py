@@ -1,4 +1,4 @@
-"""The gradient step against PPO's loss and Adam's rule, calculated independently in float64."""
+"""The gradient step follows PPO's loss and Adam's rule, computed independently in float64."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def make(**flags):
 
 
 def reference_loss(args, agent, b):
-    """From the parameters to the loss, without the agent's own methods."""
+    """Computes the loss and the metrics from the parameters, without the agent's own methods."""
 
     def mlp(layers, x):
         for layer in layers:

@@ -1,12 +1,13 @@
-"""What ppo.py takes besides the simulation: its update, and its rollout beyond the environments' steps.
+"""How long ppo.py takes without the simulation: its update, and its rollout except for the environments' steps.
 
     uv run tests/benchmarks/learner.py                                  # on a GPU
     uv run tests/benchmarks/learner.py --no-cuda --shapes 16x100 --num_minibatches 8        # on a CPU
 
-It trains on environments that are made of nothing but tensors, with 42 observations and 8 actions, inside the real
-ManiSkillVectorEnv. Variants (step by step, compiled, CUDA graphs) take turns, since a shared machine drifts; of each
-run the first iterations warm up. Beside them stand two floors: of arithmetic, the time that the products of the
-networks' matrices take alone at the same shapes, and, on a GPU, of launching as many kernels one by one.
+It trains on environments that consist only of tensors, with observations of 42 numbers and actions of 8, inside the
+real ManiSkillVectorEnv. The variants (step by step, compiled, CUDA graphs) take turns, because the speed of a shared
+machine drifts. The first iterations of each run warm up. The table also shows two lower limits: the time of the
+networks' matrix products alone, at the same shapes, and, on a GPU, the time to launch 100 kernels per minibatch one by
+one.
 """
 
 import argparse
@@ -37,7 +38,7 @@ VARIANTS = {
 
 
 class NoSimulation(gym.Env):
-    """Random observations and rewards, episodes that end at different times: as cheap as an environment can be."""
+    """As cheap as an environment can be: constant random observations and rewards. Episodes end at different times."""
 
     reconfiguration_freq, max_episode_steps, metadata = 0, LIMIT, {}
 
@@ -74,7 +75,7 @@ def make_envs(args, num_envs, seed, evaluation=False, record=None):
 
 
 def train(flags, warm_up):
-    """What a run in this process logged of each iteration after `warm_up` ones: a list of dicts."""
+    """Train in this process; returns the rows logged after the first `warm_up` iterations, a list of dicts."""
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = ppo.parse_args([*flags.split(), "--exp_name", f"{folder}/x", "--eval_freq", "0", "--num_eval_envs", "1",
                                "--num_eval_episodes", "1", "--num_actors", "1", "--target_kl", "None",
@@ -86,13 +87,13 @@ def train(flags, warm_up):
 
 
 def run(flags, warm_up):
-    """(rollout seconds, update seconds) of an iteration, medians."""
+    """Train; returns the median seconds that the rollout and the update of an iteration take."""
     rows = train(flags, warm_up)
     return [statistics.median(row[k] for row in rows) for k in ("rollout_time", "update_time")]
 
 
 def timed(function, device, repetitions=5):
-    """Median seconds of a call."""
+    """Returns the median seconds of a call."""
     seconds = []
     for _ in range(repetitions + 2):
         if device.type == "cuda":
@@ -106,7 +107,8 @@ def timed(function, device, repetitions=5):
 
 
 def products(rows, device):
-    """The matrix products of a forward and backward pass of both networks on `rows` observations."""
+    """Returns a function that computes the matrix products of a forward and backward pass of both networks on `rows`
+    observations."""
     sizes = [(OBS, 256), (256, 256), (256, 256), (256, ACT)] + [(OBS, 256), (256, 256), (256, 256), (256, 1)]
     operands = [[torch.randn(*shape, device=device) for shape in ((rows, i), (i, o), (rows, o))] for i, o in sizes]
 
@@ -158,7 +160,7 @@ def main():
         rows = num_envs * num_steps // options.num_minibatches
         floor = timed(products(rows, device), device) * minibatches
         print(f"\n{num_envs} environments, {num_steps} steps: minibatches of {rows}")
-        print(f"  {'':20}{'update':>26}{'times the first':>26}{'rollout beyond env.step, a step':>36}")
+        print(f"  {'':20}{'update':>26}{'speedup over the first':>26}{'rollout minus env.step, per step':>36}")
         for name in variants:
             rollout, update = zip(*times[name])
             ratios = [first[1] / own[1] for first, own in zip(times[variants[0]], times[name])]
@@ -171,7 +173,7 @@ def main():
         if cuda:
             x = torch.zeros(1, device=device)
             launches = timed(lambda x=x: [x.add_(1) for _ in range(1000)], device) / 1000
-            print(f"  {'100 launches a minibatch, one by one':40}{1000 * launches * 100 * minibatches:>10.1f}")
+            print(f"  {'100 launches per minibatch, one by one':40}{1000 * launches * 100 * minibatches:>10.1f}")
 
 
 if __name__ == "__main__":

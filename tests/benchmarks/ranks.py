@@ -1,11 +1,11 @@
-"""Training throughput of ppo.py over the number of processes that torchrun starts, one GPU each.
+"""Training throughput of ppo.py with different numbers of processes of torchrun, one GPU each.
 
     uv run tests/benchmarks/ranks.py --ranks 1 2 4 8
     uv run tests/benchmarks/ranks.py --ranks 1 2 --num_envs 8 --flags "--no-cuda --num_steps 100"     # on a CPU
 
-Each process has `--num_envs` environments, so that the work grows with their number. The numbers take turns, several
-repetitions of each, since a shared machine drifts: compare ratios. On a machine without a GPU one process uses all
-cores already, through its actors: there the table shows what several cost, not what they gain.
+Each process has `--num_envs` environments, so the work grows with the number of processes. The numbers take turns, with
+several repetitions each, because the speed of a shared machine drifts: compare ratios. On a machine without a GPU, the
+actors of one process already use all cores: there the table shows what more processes cost, not what they gain.
 """
 
 import argparse
@@ -21,7 +21,8 @@ SCRIPT = Path(__file__).parents[2] / "ppo.py"
 
 
 def steps_per_second(ranks, options):
-    """Medians over iterations after two that warm up: all, rollout phase, update phase."""
+    """Train; returns the median steps per second of whole iterations, of their rollouts and of their updates. The first
+    two iterations warm up and do not count."""
     with tempfile.TemporaryDirectory() as folder:
         steps = next((int(a) for f, a in zip(options.flags, options.flags[1:]) if f == "--num_steps"), 50)
         batch = options.num_envs * steps * ranks
@@ -51,8 +52,8 @@ def main():
     for _ in range(options.repetitions):
         for ranks in options.ranks:
             rates[ranks].append(steps_per_second(ranks, options))
-    print(f"{options.num_envs} environments a process; steps/s, median (lowest to highest) of {options.repetitions}")
-    print(f"{'processes':>10}{'all':>28}{'rollout':>28}{'update':>28}{'times the first':>28}")
+    print(f"{options.num_envs} environments per process; steps/s, median (lowest to highest) of {options.repetitions}")
+    print(f"{'processes':>10}{'all':>28}{'rollout':>28}{'update':>28}{'speedup over the first':>28}")
     for ranks in options.ranks:
         columns = [*zip(*rates[ranks]), [a[0] / b[0] for a, b in zip(rates[ranks], rates[options.ranks[0]])]]
         cells = [f"{statistics.median(x):,.{n}f} ({min(x):,.{n}f} to {max(x):,.{n}f})"

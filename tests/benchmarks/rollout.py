@@ -1,16 +1,16 @@
-"""How fast the CPU simulates: a batch against ManiSkill's single environment, and the rollout phase of training against
-physics alone and against another version of the scripts.
+"""How fast the CPU simulates: a batch compared with ManiSkill's single environment, and the rollout phase of training
+compared with physics alone and with another version of the scripts.
 
     uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt
     uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt --base ../other-worktree
 
-The candidates take turns, several repetitions of each, since a shared machine drifts: compare ratios.
+The candidates take turns, with several repetitions each, because the speed of a shared machine drifts: compare ratios.
 
-  single, batch    one process, random actions, one environment, 16 and 32
-  rollout phase    of ppo.py with the trained policy, on all cores, as ppo.py itself logs it
-  base             the same of the ppo.py in the folder --base
-  physics alone    on all cores at once: the calls that those rollouts made to the physics systems, again, from the same
-                   states, and nothing but their step() is timed
+  single, batch    one process with random actions in one environment, in 16 and in 32
+  rollout phase    rollouts of ppo.py with the trained policy on all cores, as ppo.py itself logs them
+  base             the same for the ppo.py in the folder --base
+  physics alone    on all cores at once: repeats the calls of such a rollout to the physics systems, from the same
+                   states; only their step() is timed
 """
 
 import argparse
@@ -35,7 +35,7 @@ import torch.multiprocessing as mp
 
 
 def random_actions(env_id, num_envs, steps):
-    """Steps a second of one process."""
+    """Returns the steps per second of one process."""
     torch.set_num_threads(1)
     env = gym.make(env_id, num_envs=num_envs, obs_mode="state", sim_backend="physx_cpu", render_backend="none")
     env.reset(seed=0)
@@ -52,15 +52,15 @@ def random_actions(env_id, num_envs, steps):
 
 
 def rollout_phase(script, checkpoint, iterations):
-    """Median steps a second of the rollout phase of training that leaves the policy as it is."""
+    """Returns the median steps per second of the rollout phase. This training leaves the policy as it is."""
     with tempfile.TemporaryDirectory() as folder:
-        steps = 1600 * iterations
+        batch_size = ppo.parse_args(["--no-cuda"]).batch_size
         flags = (f"--no-cuda --no-capture_video --exp_name x --eval_freq 0 --num_eval_episodes 2 --num_eval_envs 2 "
-                 f"--total_timesteps {steps} --learning_rate 1e-12 --update_epochs 1")  # fmt: skip
+                 f"--total_timesteps {batch_size * iterations} --learning_rate 1e-12 --update_epochs 1")  # fmt: skip
         command = [sys.executable, str(script), *flags.split(), "--checkpoint", str(checkpoint)]
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
         rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]
-    rates = [1600 / row["rollout_time"] for row in rows if row["kind"] == "train"]
+    rates = [batch_size / row["rollout_time"] for row in rows if row["kind"] == "train"]
     return statistics.median(rates[2:])
 
 
@@ -80,7 +80,7 @@ class Recorder:
         self.known = [system.pack() for system in self.px.systems]
 
     def replay(self):
-        """Seconds in step() alone."""
+        """Repeat the calls; returns the seconds in step() alone."""
         seconds, applied, systems = 0.0, None, self.px.systems
         for started, targets in self.log:
             for i, state in started:
@@ -122,7 +122,7 @@ def physics_alone(index, num_actors, checkpoint, barrier, queue):
 
 
 def physics_on_all_cores(checkpoint):
-    """Steps a second of all cores together."""
+    """Returns the steps per second of all cores together."""
     context, cores = mp.get_context("spawn"), ppo.num_cores()
     barrier, queue = context.Barrier(cores), context.Queue()
     arguments = (cores, checkpoint, barrier, queue)

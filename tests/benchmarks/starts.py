@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-import ppo  # before mani_skill, whose software renderer it finds
+import ppo  # before mani_skill: ppo lets it use a software renderer
 
 # isort: split
 import gymnasium as gym

@@ -1,14 +1,15 @@
-"""Training throughput on PushCube-v1 with CPU simulation, against Stable-Baselines3, and next to other work.
+"""Training throughput on PushCube-v1 with CPU simulation, compared with Stable-Baselines3, and next to other work.
 
     uv run --group benchmark tests/benchmarks/throughput.py
 
-One run alternates between the candidates, several repetitions of each, and prints medians and spread, since a shared
-machine drifts: compare ratios, not absolute figures. Both learners have the same networks (3 x 256, tanh, one for
-policy and one for value), minibatch size, epochs and batch, and no target KL that would end an update early:
+One run alternates between the candidates, with several repetitions each, and prints medians and spread. The speed of a
+shared machine drifts: compare ratios, not absolute figures. Both learners have the same networks (3 x 256, tanh, one
+for policy and one for value), minibatch size, epochs and batch. Neither has a target KL, and both have a
+fixed learning rate. The candidates:
 
   ppo.py            its defaults: one process for each core, a batch of 32 environments in each
   SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
-  ppo.py, loaded    ppo.py while two other processes do nothing but count
+  ppo.py, loaded    ppo.py while two other processes run endless loops
 """
 
 import argparse
@@ -28,13 +29,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo
 
-BATCH, MINIBATCHES, EPOCHS = 1600, 4, 8
+BATCH, MINIBATCHES, EPOCHS = ppo.parse_args(["--no-cuda"]).batch_size, 4, 8
 SCRIPT = Path(ppo.__file__)
 
 
 def ours(iterations):
-    """ppo.py as a command. Returns for each iteration its steps a second."""
-    flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None "
+    """Run ppo.py as a command; returns the steps per second of each iteration after the first."""
+    flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None --desired_kl None "
              f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations} --eval_freq 0 --num_eval_episodes 2 "
              "--num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
@@ -44,7 +45,7 @@ def ours(iterations):
     return [row["sps"] for row in rows if row["kind"] == "train"][1:]
 
 
-def ours_beside_other_work(iterations):
+def ours_next_to_other_work(iterations):
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
         return ours(iterations)
@@ -91,7 +92,7 @@ def stable_baselines3(iterations):
     return [BATCH / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
 
 
-CANDIDATES = {"ppo.py": ours, "SB3": stable_baselines3, "ppo.py, loaded": ours_beside_other_work}
+CANDIDATES = {"ppo.py": ours, "SB3": stable_baselines3, "ppo.py, loaded": ours_next_to_other_work}
 
 
 def compare(options):
@@ -113,13 +114,13 @@ def compare(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=8, help="iterations of 1600 steps in each repetition")
+    parser.add_argument("--iterations", type=int, default=8, help="iterations in each repetition")
     parser.add_argument("--cores", type=int, nargs="+", default=sorted({1, ppo.num_cores()}), help="how many to use")
     options = parser.parse_args()
 
     all_cores = sorted(os.sched_getaffinity(0))
     for cores in options.cores:
-        os.sched_setaffinity(0, all_cores[:cores])  # as its actors do
+        os.sched_setaffinity(0, all_cores[:cores])  # subprocesses inherit this
         compare(options)
 
 

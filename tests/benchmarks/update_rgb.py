@@ -1,11 +1,11 @@
-"""The update of ppo_rgb.py, in images a second, and its memory: precision, memory order, compiled, side by side.
+"""Speed (images per second) and memory of ppo_rgb.py's update, by precision and memory format, and compiled.
 
     uv run tests/benchmarks/update_rgb.py
     uv run tests/benchmarks/update_rgb.py --num_envs 8 --num_steps 16 --size 64 --num_minibatches 8      # on a CPU
 
-The variants take turns, several repetitions of each, since a shared machine drifts: the table gives medians, and the
-spread of the ratio to the first variant of the same turn. Images lie in the rollout's uint8 buffers, from which each
-minibatch is gathered, as in `train`.
+The variants take turns, with several repetitions each, because the speed of a shared machine drifts. The table gives
+medians, and the spread of the ratio to the first variant in the same turn. As in `train`, each minibatch is gathered
+from the rollout's uint8 buffers.
 """
 
 import argparse
@@ -34,7 +34,7 @@ class Variant:
         self.optimizer = torch.optim.Adam(self.agent.parameters(), fused=True)
 
     def update(self, obs, others, num_minibatches):
-        """Mean seconds of `num_minibatches` minibatches."""
+        """Run `num_minibatches` minibatches; returns the mean seconds of one."""
         cuda = others[0].is_cuda
         if cuda:
             torch.cuda.reset_peak_memory_stats()
@@ -93,9 +93,9 @@ def main():
     for repetition in range(options.repetitions + 1):
         for variant in variants if repetition % 2 else variants[::-1]:
             seconds = variant.update(obs, others, min(4, options.num_minibatches))
-            if repetition:  # the first warms up
+            if repetition:  # the first repetition warms up
                 variant.seconds.append(seconds)
-    print(f"{'':36}{'images/s':>10}{'times the first (lowest, highest)':>36}{'peak MiB':>10}")
+    print(f"{'':36}{'images/s':>10}{'speedup over the first (min, max)':>36}{'peak MiB':>10}")
     for variant in variants:
         ratios = sorted(a / b for a, b in zip(variants[0].seconds, variant.seconds))
         rate = args.minibatch_size / statistics.median(variant.seconds)

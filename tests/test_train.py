@@ -1,4 +1,4 @@
-"""The steps that stand inline in `train`, each against its own definition, on records of short runs."""
+"""Each step inside `train` follows its definition, checked on records of short runs."""
 
 import contextlib
 import copy
@@ -17,7 +17,7 @@ from test_rollout import gae_of_episodes
 import ppo
 
 NUM_ENVS, NUM_STEPS, ITERATIONS = 8, 6, 4
-# env_id is that of any task: `make_envs` gives another one
+# env_id can be that of any task: the tests replace `make_envs`
 ARGS = replace(
     SMALL, env_id="PushCube-v1", num_actors=1, num_envs=NUM_ENVS, num_steps=NUM_STEPS, num_eval_envs=2,
     num_eval_episodes=3, total_timesteps=NUM_ENVS * NUM_STEPS * ITERATIONS, num_minibatches=4, update_epochs=3,
@@ -26,17 +26,12 @@ ARGS = replace(
 
 
 class Reach(BatchedReach):
-    """Reach with what ManiSkill has besides: the seeds of all environments where some are reset."""
+    """BatchedReach with short episodes."""
 
     max_episode_steps = 5
 
     def __init__(self, num_envs):
         super().__init__(num_envs, "cpu")
-
-    def reset(self, *, seed=None, options=None):
-        if seed is not None and options:
-            seed = [seed[i] for i in options["env_idx"]]
-        return super().reset(seed=seed, options=options)
 
 
 def copied(x):
@@ -44,7 +39,7 @@ def copied(x):
 
 
 class Run:
-    """A run of `train` and what happened in it, iteration by iteration."""
+    """Runs `train` and records what happens in each iteration."""
 
     def __init__(self, monkeypatch, args, evaluations=None):
         self.args, self.iterations, self.evaluations = args, [], []
@@ -105,7 +100,8 @@ def run(in_tmp, monkeypatch):
 
 
 def flat_batch(args, storage):
-    """The rows to learn from, by name, as (step, environment) follow each other; advantages by their definition."""
+    """Returns the arrays to learn from, with one row for each (step, environment), in this order. Advantages follow
+    their definition."""
     columns = {k: v.double().numpy() for k, v in storage.items()}
     advantages = gae_of_episodes(columns, args.gamma, args.gae_lambda, args.finite_horizon_gae)
     columns |= dict(advantages=advantages, returns=advantages + columns["values"])
@@ -115,14 +111,14 @@ def flat_batch(args, storage):
 
 @pytest.mark.parametrize("finite_horizon", [False, True])
 def test_each_epoch_learns_from_each_sample_once(run, finite_horizon):
-    """The minibatches of an epoch are a permutation of the rollout, whole rows of it, another one in each epoch."""
+    """The minibatches of an epoch are a permutation of the rollout's rows. Each epoch has another permutation."""
     record = run(finite_horizon_gae=finite_horizon, norm_obs=True)
     orders = []
     assert len(record.iterations) == ITERATIONS
     for iteration in record.iterations:
         truth = flat_batch(record.args, iteration["storage"])
         assert len(iteration["updates"]) == 3 * 4
-        place = {x: i for i, x in enumerate(truth[2][:, 0].tolist())}  # log-probabilities tell the rows apart
+        place = {x: i for i, x in enumerate(truth[2][:, 0].tolist())}  # log-probabilities identify the rows
         assert len(place) == NUM_ENVS * NUM_STEPS
         for epoch in range(3):
             updates = iteration["updates"][4 * epoch : 4 * epoch + 4]
@@ -162,7 +158,8 @@ def test_gradients_of_earlier_minibatches_are_gone():
 
 
 def test_learning_rates(run):
-    """They fall linearly, from the peak in the first iteration to one part of it in the last, or stay."""
+    """With anneal_lr, learning rates fall linearly: to 1/n of the first rate in the last of n iterations. Otherwise
+    they are constant."""
     for anneal_lr in (True, False):
         record = run(
             anneal_lr=anneal_lr, critic_learning_rate=5e-3, logstd_lr_factor=3.0, exp_name=f"anneal_{anneal_lr}"
@@ -176,7 +173,8 @@ def test_learning_rates(run):
 
 @pytest.mark.parametrize("desired_kl, reached", [(0.003, {2 / 3, 1, 1.5}), (1e-9, {2 / 3, 1.5}), (1e6, {1.5})])
 def test_learning_rate_follows_the_divergence(run, desired_kl, reached):
-    """The KL divergence of each minibatch sets the policy's rate for the next one, within bounds; not the critic's."""
+    """The KL divergence of each minibatch changes the policy's rate for the next one, within bounds. The critic's rate
+    stays."""
     record = run(desired_kl=desired_kl, logstd_lr_factor=3.0, exp_name=f"desired_{desired_kl}")
     rate, factors = 1e-3, set()
     for update in [update for iteration in record.iterations for update in iteration["updates"]]:
@@ -189,7 +187,7 @@ def test_learning_rate_follows_the_divergence(run, desired_kl, reached):
 
 
 def test_normalization_follows_the_update(run):
-    """Statistics are those that the rollout acted with until its update is over, then those of all data so far."""
+    """An update uses the same statistics as its rollout. After it, the statistics cover all data so far."""
     record = run(norm_obs=True)
     seen = []
     for number, iteration in enumerate(record.iterations):
@@ -209,7 +207,8 @@ def test_normalization_follows_the_update(run):
 
 
 def test_the_first_epoch_beyond_target_kl_is_the_last(run):
-    """By its last minibatch, as in CleanRL; the threshold is what the first epochs of a longer run had at most."""
+    """The last minibatch of an epoch decides, as in CleanRL. The threshold is the largest divergence in the first two
+    epochs of a run without target_kl."""
 
     def divergences(record):
         kl = [
@@ -239,25 +238,25 @@ def test_each_rollout_acts_with_what_was_learned_before_it(run):
         if number + 1 < ITERATIONS:
             following = record.iterations[number + 1]
             assert torch.equal(weights(following["before"]), after)
-            assert torch.equal(following["first_obs"], iteration["next_obs"]), "episodes go on"
+            assert torch.equal(following["first_obs"], iteration["next_obs"]), "episodes must go on"
     last = record.checkpoint("last.pt")
     assert torch.equal(weights(last["agent"]), after) and torch.equal(weights(record.evaluations[-1]["weights"]), after)
     assert last["iteration"] == ITERATIONS and last["global_step"] == ARGS.total_timesteps and record.code == 0
 
 
 def test_evaluations(run):
-    """Always the same episodes, without exploration, at the steps that the rows name."""
+    """Every evaluation plays the same episodes without exploration. The rows name the steps of the evaluations."""
     record = run(eval_seed=70, eval_freq=3)
     assert [row["global_step"] for row in record.eval_rows] == [0, 144, 192], "the final policy is evaluated too"
     for evaluation in record.evaluations:
         num_episodes, seed, num_steps, rebuild, separately = evaluation["arguments"]
-        # these environments are no batch of ManiSkill's, whose episodes start one by one
+        # `separately` is for batches of ManiSkill's own tasks, and this is none
         assert (num_episodes, seed, num_steps, rebuild, separately) == (3, 70, 5, 0, False)
         assert not evaluation["flags"]
 
 
 def test_training_rows(run):
-    """Means over the episodes that ended, over all minibatches, and the explained variance by its definition."""
+    """Rows contain means over the finished episodes, means over all minibatches, and the explained variance."""
     record = run(reward_scale=0.1)
     for row, iteration in zip(record.train_rows, record.iterations, strict=True):
         sums = dict(iteration["sums"])
@@ -281,9 +280,9 @@ def scripted(*scores):
     [
         # success counts first, whatever the return
         ([([0, 0], [5, 5]), ([0, 1], [0, 1]), ([0, 0], [9, 9]), ([0, 1], [2, 2]), ([0, 1], [1, 1])], 3),
-        # of equals the first stays
+        # of equal scores the first one is kept
         ([([1, 1], [3, 3]), ([1, 1], [3, 3]), ([1, 1], [2, 3]), ([1, 1], [3, 3]), ([0, 1], [9, 9])], 0),
-        # what is not finite is never the best
+        # a score that is not finite is never the best
         ([([0, 0], [1, 1]), ([1, 1], [math.nan, 3]), ([0, 1], [math.inf, 3]), ([0, 1], [1, 1]), ([0, 0], [1, 1])], 3),
     ],
 )
