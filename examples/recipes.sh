@@ -31,13 +31,16 @@ curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_
 
 # --- states, CPU: control over hundreds of steps ---
 
-control() { python ppo.py --no-cuda --gamma 0.99 --gae_lambda 0.95 --num_eval_episodes 8 --eval_freq 20 "$@"; }
+control() {
+    python ppo.py --no-cuda --gamma 0.99 --gae_lambda 0.95 --num_steps 100 --num_minibatches 16 \
+        --num_eval_episodes 8 --eval_freq 5 "$@"
+}
 
 cartpole_balance_cpu() { control --env_id MS-CartpoleBalance-v1 --total_timesteps 96000 "$@"; }
 cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timesteps 400000 "$@"; }
 hopper_stand_cpu() { control --env_id MS-HopperStand-v1 --total_timesteps 800000 "$@"; }
 ant_walk_cpu() { control --env_id MS-AntWalk-v1 --total_timesteps 800000 "$@"; }
-humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --control_mode pd_joint_delta_pos --total_timesteps 300000 "$@"; }
+humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
 # --- states, CPU: in hand ---
 

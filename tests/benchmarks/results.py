@@ -42,8 +42,11 @@ def read_rows(path: Path) -> list[dict]:
 
 
 def find_commit() -> str:
-    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-    return subprocess.run(command, cwd=FOLDER, check=True, capture_output=True, text=True).stdout.strip()
+    def git(*arguments):
+        return subprocess.run(["git", *arguments], cwd=FOLDER, check=True, capture_output=True, text=True).stdout
+
+    changes = git("status", "--porcelain", "--", ":/ppo.py", ":/ppo_rgb.py", ":/examples")
+    return git("rev-parse", "--short", "HEAD").strip() + ("-dirty" if changes else "")
 
 
 def describe_processor() -> str:
