@@ -837,7 +837,7 @@ def interval(values: torch.Tensor, is_rate: bool) -> tuple[float, float]:
     if is_rate:
         centre = (mean + z**2 / (2 * n)) / (1 + z**2 / n)
         half = z / (1 + z**2 / n) * math.sqrt(mean * (1 - mean) / n + z**2 / (4 * n**2))
-        return centre - half, centre + half
+        return max(0.0, centre - half), min(1.0, centre + half)
     half = z * values.double().std().item() / math.sqrt(n)
     return mean - half, mean + half
 
