@@ -54,7 +54,7 @@ def test_a_row_of_the_table(project, capsys):
 
     results.main([*command, "--table"])
     assert "1 recipes, 0 solved" in capsys.readouterr().out
-    before, _, header, _, line, _, after = (project / "README.md").read_text().splitlines()
+    before, _, _, header, _, line, _, _, after = (project / "README.md").read_text().splitlines()
     assert (before, after) == ("before", "after") and line.count("|") == header.count("|")
     assert (project / "results.png").stat().st_size > 10_000
 
@@ -76,10 +76,12 @@ def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
     path = tmp_path / "README.md"
     path.write_text(f"{results.TABLE_STARTS}\n{results.TABLE_ENDS}\n")
     rows = [make_row("push_cube_cpu", seed, success) for seed, success in ((2, 0.95), (1, 0.9), (3, 0.91))]
-    rows += [make_row("pick_cube_cpu", seed, success) for seed, success in ((1, 0.95), (2, 0.89))]
-    rows += [make_row("cartpole_balance_cpu", 1, reward=0.81), make_row("hopper_stand_cpu", 1, reward=0.79)]
+    rows += [make_row("pick_cube_cpu", seed, success) for seed, success in ((1, 0.95), (2, 0.89), (3, 1))]
+    rows += [make_row("lift_peg_upright_cpu", seed, 1.0) for seed in (1, 2)]  # a seed is missing
+    rows += [make_row("cartpole_balance_cpu", seed, reward=0.81) for seed in (1, 2, 3)]
+    rows += [make_row("hopper_stand_cpu", seed, reward=0.79) for seed in (1, 2, 3)]
     results.write_table(rows, path)
-    assert "4 recipes, 2 solved" in capsys.readouterr().out
+    assert "5 recipes, 2 solved" in capsys.readouterr().out
     bold = [line for line in path.read_text().splitlines() if "**" in line]
     assert len(bold) == 2 and "`push_cube_cpu`" in bold[0] and "0.90, 0.95, 0.91" in bold[0] and "810" in bold[1]
 

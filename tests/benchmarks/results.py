@@ -156,13 +156,13 @@ def write_table(rows: list[dict], path: Path) -> None:
         main_metric = "success_once" if "success_once" in runs[0]["best"] else "return"
         minutes = [run["training_seconds"] / 60 for run in runs]
         to_best = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
-        is_done = all(map(is_solved, runs))
+        is_done = len(runs) >= 3 and all(map(is_solved, runs))
         solved += is_done
         cells = [
             f"{'**' if is_done else ''}`{name}`{'**' if is_done else ''}",
             runs[0]["task"].rpartition(":")[2],
             f"{max(run['steps'] for run in runs):,}",
-            f"{min(minutes):.0f} to {max(minutes):.0f}",
+            f"{min(minutes):.1f} to {max(minutes):.1f}",
             each_seed("success_once"),
             each_seed("success_at_end"),
             each_seed("return"),
@@ -172,8 +172,8 @@ def write_table(rows: list[dict], path: Path) -> None:
         lines.append(f"| {' | '.join(cells)} |")
     text = path.read_text()
     before, after = text.partition(TABLE_STARTS)[0], text.partition(TABLE_ENDS)[2]
-    path.write_text("\n".join([before + TABLE_STARTS, *lines, TABLE_ENDS]) + after)
-    print(f"{path}: {len(group(rows))} recipes, {solved} solved in every seed")
+    path.write_text("\n".join([before + TABLE_STARTS, "", *lines, "", TABLE_ENDS]) + after)
+    print(f"{path}: {len(group(rows))} recipes, {solved} solved with every seed")
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
