@@ -301,7 +301,7 @@ CPU_DEFAULTS = dict(
     target_kl=0.1, eval_freq=50, num_eval_episodes=16,
 )  # fmt: skip
 TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
-CPU_ENVS_PER_CORE = 8  # and the same number for evaluation
+CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
 
 
 def layer_init(layer: nn.Module, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Module:

@@ -14,7 +14,7 @@ DIFFERENT = {
     "EnvironmentArgs", "PPOArgs", "make_env", "Agent", "check_observations", "check_task",
     "load_agent", "num_update_threads", "rollout", "train",
 }  # fmt: skip
-DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "CPU_ENVS_PER_CORE", "FIXED_FLAGS", "LIMITS"}
+DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "FIXED_FLAGS", "LIMITS"}
 DIFFERENT_HELP = {"obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs"}
 MOST_DIFFERENT_LINES = {"rollout": 12, "train": 17}
 
