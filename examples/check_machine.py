@@ -15,8 +15,9 @@ import sys
 from pathlib import Path
 from typing import Optional
 
-PACKAGES = ("mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil")
-PACKAGES += ("imageio", "filelock")
+PACKAGES = (
+    "mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil", "imageio", "filelock",
+)  # fmt: skip
 ROOT = Path(__file__).resolve().parent.parent  # ppo.py lies here
 
 VULKAN = """

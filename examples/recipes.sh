@@ -31,7 +31,7 @@ curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_
 
 # --- states, CPU: control over hundreds of steps ---
 
-# The adaptive learning rate and the fast standard deviation of the defaults stop exploring too early here.
+# With the adaptive learning rate and the fast standard deviation of the defaults, the policy explores too little.
 control() {
     python ppo.py --no-cuda --gamma 0.99 --gae_lambda 0.95 --num_steps 100 --num_minibatches 16 \
         --desired_kl None --target_kl 0.1 --logstd_lr_factor 1 --num_eval_episodes 8 --eval_freq 5 "$@"

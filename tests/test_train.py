@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import json
 import math
 from dataclasses import replace
 from unittest.mock import Mock
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from batched_env import BatchedReach
-from conftest import SMALL, box
+from conftest import SMALL, box, read_metrics
 from test_rollout import gae_of_episodes
 
 import ppo
@@ -86,7 +85,7 @@ class Run:
         with contextlib.ExitStack() as closing:
             self.code = ppo.train(copy.copy(args), closing)
         self.folder = ppo.find_run_dir(args)
-        rows = [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
+        rows = read_metrics(self.folder)
         self.train_rows = [row for row in rows if row["kind"] == "train"]
         self.eval_rows = [row for row in rows if row["kind"] == "eval"]
 

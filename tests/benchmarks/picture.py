@@ -10,6 +10,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 from matplotlib.figure import Figure
+from results import learning_curve
 
 
 def main():
@@ -25,16 +26,9 @@ def main():
     above, *below = figure.subfigures(2, 1, height_ratios=[3, 2]) if options.video else [figure]
     by_steps, by_minutes = above.subplots(1, 2, sharey=True)
     for run in options.runs:
-        rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-        seconds, points = 0.0, []
-        for row in rows:
-            if row["kind"] == "train":
-                seconds += row["rollout_time"] + row["update_time"]
-            else:
-                points.append((row["global_step"], seconds / 60, row[options.metric]))
-        steps, minutes, values = zip(*points)
+        steps, seconds, values = zip(*learning_curve(run, options.metric))
         args = json.loads((run / "args.json").read_text())["args"]
-        for axis, x in ((by_steps, steps), (by_minutes, minutes)):
+        for axis, x in ((by_steps, steps), (by_minutes, [x / 60 for x in seconds])):
             axis.plot(x, values, marker="o", markersize=3, label=run.name)
     by_steps.set(xlabel="environment steps", ylabel=f"{options.metric}, evaluation")
     by_minutes.set(xlabel="minutes of training (rollout and update)")

@@ -12,6 +12,7 @@ Stop it at any time: it skips the rows that are there, and resumes a run that wa
 
 import argparse
 import json
+import math
 import os
 import platform
 import re
@@ -28,8 +29,6 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(__file__).resolve().parent
 EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256", "--no-cuda", "--no-capture_video")
-
-
 TABLE_STARTS, TABLE_ENDS = "<!-- written by results.py -->", "<!-- end -->"
 
 
@@ -87,22 +86,28 @@ def evaluate(run_dir: Path, script: str, checkpoint: str) -> dict:
     return {k: [round(x, 4) for x in (found[k], *found.get(f"{k}_interval", ()))] for k in names}
 
 
-def learning_curve(run_dir: Path) -> list[tuple[int, float, float]]:
-    """Of each evaluation: environment steps, seconds of training, and the success rate or else the return."""
+def learning_curve(run_dir: Path, metric: str) -> list[tuple[int, float, float]]:
+    """Of each evaluation: environment steps, seconds of training (rollout and update), and the metric."""
     seconds, points = 0.0, []
-    for row in map(json.loads, (run_dir / "metrics.jsonl").read_text().splitlines()):
+    for row in read_rows(run_dir / "metrics.jsonl"):
         if row["kind"] == "train":
             seconds += row["rollout_time"] + row["update_time"]
         else:
-            points.append((row["global_step"], round(seconds, 1), round(row.get("success_once", row["return"]), 4)))
+            points.append((row["global_step"], round(seconds, 1), round(row[metric], 4)))
     return points
+
+
+def main_metric(metrics: dict) -> str:
+    """The success rate, or the return if the task knows no success."""
+    return "success_once" if "success_once" in metrics else "return"
 
 
 def make_row(recipe: str, seed: int, flags: list[str]) -> dict:
     script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
     run_dir = train(recipe, seed, flags, script)
     about = json.loads((run_dir / "args.json").read_text())
-    curve = learning_curve(run_dir)
+    best, last = (evaluate(run_dir, script, checkpoint) for checkpoint in ("best.pt", "last.pt"))
+    curve = learning_curve(run_dir, main_metric(best))
     highest = max(value for _, _, value in curve)
     steps, seconds, _ = next(point for point in curve if point[2] >= 0.9 * highest)
     return dict(
@@ -116,8 +121,8 @@ def make_row(recipe: str, seed: int, flags: list[str]) -> dict:
         versions=about["versions"],
         steps=curve[-1][0],
         training_seconds=curve[-1][1],
-        best=evaluate(run_dir, script, "best.pt"),
-        last=evaluate(run_dir, script, "last.pt"),
+        best=best,
+        last=last,
         steps_to_nine_tenths_of_the_best=steps,
         seconds_to_nine_tenths_of_the_best=seconds,
         curve=curve,
@@ -135,53 +140,55 @@ def group(rows: list[dict]) -> dict[str, list[dict]]:
 def is_solved(row: dict) -> bool:
     """Nine of ten episodes succeed; without success, the return is 0.8 of its maximum: 1 at every step."""
     best = row["best"]
-    if "success_once" in best:
+    if main_metric(best) == "success_once":
         return best["success_once"][0] >= 0.9
     return best["return"][0] >= 0.8 * best["episode_len"][0]
 
 
+def join_seeds(runs: list[dict], policy: str, metric: str) -> str:
+    """The means of the runs' evaluations, in the order of the seeds; nothing if the task does not have the metric."""
+    means = [run[policy][metric][0] for run in runs if metric in run[policy]]
+    digits = 0 if means and means[0] >= 100 else 2
+    return ", ".join(f"{mean:,.{digits}f}" for mean in means)
+
+
 def write_table(rows: list[dict], path: Path) -> None:
     """Replace the table in this file."""
-    lines = [
-        "| recipe | task | steps | minutes | success once | success at end | return | last policy | 90% after |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    solved = 0
-    for name, runs in group(rows).items():
-
-        def each_seed(metric: str, policy: str = "best", runs=runs) -> str:
-            digits = 0 if metric == "return" and runs[0][policy][metric][0] >= 100 else 2
-            return ", ".join(f"{run[policy][metric][0]:,.{digits}f}" for run in runs if metric in run[policy])
-
-        main_metric = "success_once" if "success_once" in runs[0]["best"] else "return"
-        minutes = [run["training_seconds"] / 60 for run in runs]
-        to_best = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
-        is_done = len(runs) >= 3 and all(map(is_solved, runs))
-        solved += is_done
-        cells = [
-            f"{'**' if is_done else ''}`{name}`{'**' if is_done else ''}",
+    names = ("recipe", "task", "steps", "seeds", "minutes", "success once", "success at end", "return", "last policy")
+    table = [(*names, "90% after"), ["---"] * 10]
+    groups, num_solved = group(rows), 0
+    for name, runs in groups.items():
+        name = f"`{name}`"
+        if len(runs) >= 3 and all(map(is_solved, runs)):
+            name = f"**{name}**"
+            num_solved += 1
+        line = [
+            name,
             runs[0]["task"].rpartition(":")[2],
             f"{max(run['steps'] for run in runs):,}",
-            f"{min(minutes):.1f} to {max(minutes):.1f}",
-            each_seed("success_once"),
-            each_seed("success_at_end"),
-            each_seed("return"),
-            each_seed(main_metric, "last"),
-            f"{statistics.median(to_best):,.0f}",
+            ", ".join(str(run["seed"]) for run in runs),
+            ", ".join(f"{run['training_seconds'] / 60:.1f}" for run in runs),
+            join_seeds(runs, "best", "success_once"),
+            join_seeds(runs, "best", "success_at_end"),
+            join_seeds(runs, "best", "return"),
+            join_seeds(runs, "last", main_metric(runs[0]["last"])),
+            f"{statistics.median(run['steps_to_nine_tenths_of_the_best'] for run in runs):,.0f}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
+        table.append(line)
+    lines = [f"| {' | '.join(line)} |" for line in table]
     text = path.read_text()
     before, after = text.partition(TABLE_STARTS)[0], text.partition(TABLE_ENDS)[2]
     path.write_text("\n".join([before + TABLE_STARTS, "", *lines, "", TABLE_ENDS]) + after)
-    print(f"{path}: {len(group(rows))} recipes, {solved} solved with every seed")
+    print(f"{path}: {len(groups)} recipes, {num_solved} solved with every seed")
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
     """A picture a recipe: the mean of the seeds, and their range."""
     groups = group(rows)
     columns = min(5, len(groups))
-    figure = Figure(figsize=(2.6 * columns, 2.1 * -(-len(groups) // columns)), layout="constrained")
-    axes = figure.subplots(-(-len(groups) // columns), columns, squeeze=False).flatten()
+    lines = math.ceil(len(groups) / columns)
+    figure = Figure(figsize=(2.6 * columns, 2.1 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).flatten()
     for axis in axes[len(groups) :]:
         axis.axis("off")
     for axis, (name, runs) in zip(axes, groups.items()):
@@ -195,7 +202,7 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         axis.plot(x, [statistics.mean(v) for v in values])
         axis.set_title(name.replace("_cpu", ""), fontsize=8)
         axis.tick_params(labelsize=7)
-        is_rate = "success_once" in runs[0]["best"]
+        is_rate = main_metric(runs[0]["best"]) == "success_once"
         axis.set_ylim(0, 1.03 if is_rate else None)
         axis.set_ylabel("success rate" if is_rate else "return", fontsize=7)
         axis.grid(alpha=0.3)
