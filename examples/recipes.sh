@@ -13,7 +13,7 @@ cd "$(dirname "$0")/.."
 tabletop() { python ppo.py --no-cuda --eval_freq 20 "$@"; }
 
 push_cube_cpu() { tabletop --env_id PushCube-v1 --eval_freq 10 "$@"; }
-pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 300000 "$@"; }
+pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 400000 "$@"; }
 pick_cube_cpu() { tabletop --env_id PickCube-v1 --total_timesteps 800000 "$@"; }
 pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
