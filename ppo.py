@@ -1148,10 +1148,10 @@ class BatchedPhysx:
                 a, b = contact.bodies
                 for key, sign in ((a, 1), (b, -1), ((a, b), 1), ((b, a), -1)):
                     self.contacts[key].append((contact, sign))
-        for row, key in zip(query.cuda_impulses.data.zero_(), query.bodies):
+        for row, key in zip(query.cuda_impulses.data.zero_().numpy(), query.bodies):
             for contact, sign in self.contacts.get(key, ()):
-                impulse = np.sum([point.impulse for point in contact.points], axis=0, dtype=np.float32)
-                row += sign * torch.from_numpy(impulse)
+                for point in contact.points:
+                    row += sign * point.impulse
 
     gpu_create_contact_pair_impulse_query = gpu_create_contact_body_impulse_query
     gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
