@@ -192,7 +192,7 @@ class PPOArgs:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1600 / num_envs, at least 5)"""
     anneal_lr: bool = False
-    """lower the learning rate linearly to zero over the run (the policy's: with desired_kl, lower that instead)"""
+    """lower the learning rate linearly to zero over the run (with desired_kl: that one, and the rate of the critic)"""
     gamma: float = 0.8
     """discount factor"""
     gae_lambda: float = 0.9
