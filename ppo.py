@@ -192,7 +192,7 @@ class PPOArgs:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1600 / num_envs, at least 5)"""
     anneal_lr: bool = False
-    """lower the learning rate linearly to zero over the run (with desired_kl: that one, and the rate of the critic)"""
+    """lower the learning rate linearly to zero over the run (with desired_kl: desired_kl and the critic's rate)"""
     gamma: float = 0.8
     """discount factor"""
     gae_lambda: float = 0.9
@@ -1542,11 +1542,11 @@ def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
 def adapt_learning_rate(optimizer, kl: torch.Tensor) -> None:
     """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
     less than half of it (Rudin et al. 2022, arXiv 2109.11978), between a hundredth and ten times of the initial one."""
-    for group in optimizer.param_groups:
-        desired_kl = group["desired_kl"]
-        if desired_kl is not None:
-            factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
-            group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
+    groups = [group for group in optimizer.param_groups if group["desired_kl"] is not None]
+    desired_kl = groups[0]["desired_kl"]  # they share it
+    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
+    for group in groups:
+        group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
 
 
 # ----- Logging --------------------------------------------------------------------------------------------------------

@@ -113,6 +113,7 @@ def main_metric(metrics: dict) -> str:
 
 def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict:
     script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
+    commit = find_commit()  # the one that trains; there may be another when the row is written
     run_dir = train(recipe, seed, flags, script)
     about = json.loads((run_dir / "args.json").read_text())
     best = evaluate(run_dir, script, "best.pt")
@@ -126,7 +127,7 @@ def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict
         further_flags=shlex.join(flags),
         seed=seed,
         flags=about["args"],
-        commit=find_commit(),
+        commit=commit,
         hardware=f"{about['device']}, {describe_processor()}",
         runs_at_once=num_at_once,
         versions=about["versions"],
