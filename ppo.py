@@ -192,7 +192,7 @@ class PPOArgs:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: 50; on a CPU 1600 / num_envs, at least 5)"""
     anneal_lr: bool = False
-    """lower the learning rate linearly to zero over the run (with desired_kl: desired_kl and the critic's rate)"""
+    """lower the learning rate linearly to zero over the run (with desired_kl: that of the critic only)"""
     gamma: float = 0.8
     """discount factor"""
     gae_lambda: float = 0.9
@@ -454,7 +454,7 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     with torch.no_grad():
         approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
         if args.desired_kl is not None:
-            adapt_learning_rate(optimizer, average(approx_kl))
+            adapt_learning_rate(optimizer, average(approx_kl), args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -601,12 +601,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
         torch.set_num_threads(num_update_threads())
         if args.anneal_lr:
-            remaining = 1 - iteration / args.num_iterations
-            for group in optimizer.param_groups:  # fill tensors: Python numbers are frozen in a CUDA graph
-                if group["desired_kl"] is None:
-                    group["lr"].fill_(group["initial_lr"] * remaining)
-                else:
-                    group["desired_kl"].fill_(args.desired_kl * remaining)
+            for group in optimizer.param_groups:
+                if not group["adapts"]:  # fill a tensor: Python numbers are frozen in a CUDA graph
+                    group["lr"].fill_(group["initial_lr"] * (1 - iteration / args.num_iterations))
         problems = sum(gather([problem for _, problem in results if problem]), [])  # of all processes
         update_metrics = []
         for _ in range(0 if problems else args.update_epochs):  # learn from finite numbers only
@@ -1517,12 +1514,11 @@ def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.
     special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
     actor = [p for p in agent.parameters() if id(p) not in special]
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
-    desired_kl = None if args.desired_kl is None else torch.tensor(args.desired_kl, device=device)
-    logstd_lr = args.learning_rate * args.logstd_lr_factor
+    adapts = args.desired_kl is not None
     groups = [
-        dict(params=actor, initial_lr=args.learning_rate, desired_kl=desired_kl),
-        dict(params=[agent.actor_logstd], initial_lr=logstd_lr, desired_kl=desired_kl),
-        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, desired_kl=None),
+        dict(params=actor, initial_lr=args.learning_rate, adapts=adapts),
+        dict(params=[agent.actor_logstd], initial_lr=args.learning_rate * args.logstd_lr_factor, adapts=adapts),
+        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, adapts=False),
     ]
     for group in groups:
         group["lr"] = torch.tensor(group["initial_lr"], device=device)  # where a CUDA graph reads it
@@ -1539,14 +1535,13 @@ def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
         group.update(flag)
 
 
-def adapt_learning_rate(optimizer, kl: torch.Tensor) -> None:
+def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
     """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
     less than half of it (Rudin et al. 2022, arXiv 2109.11978), between a hundredth and ten times of the initial one."""
-    groups = [group for group in optimizer.param_groups if group["desired_kl"] is not None]
-    desired_kl = groups[0]["desired_kl"]  # they share it
     factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
-    for group in groups:
-        group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
+    for group in optimizer.param_groups:
+        if group["adapts"]:
+            group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
 
 
 # ----- Logging --------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ pull_cube_tool_cpu() { tabletop --env_id PullCubeTool-v1 --total_timesteps 80000
 peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timesteps 800000 "$@"; }
 two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 400000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
-push_to_goal_cpu() { tabletop --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 250000 "$@"; }
+push_to_goal_cpu() { tabletop --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 400000 "$@"; }
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
 curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
 
