@@ -1,7 +1,6 @@
 """Several processes, started by torchrun, train together as one process would with all their environments."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -116,7 +115,8 @@ def test_stopped_resumed_and_killed(tmp_path):
     start = time.monotonic()
     output, _ = process.communicate(timeout=60)
     assert time.monotonic() - start < 20
-    assert process.returncode != 0 and re.search("Connection (closed|reset) by peer", output), output
+    # process 0 loses its connection; torchrun may end it before it has printed so
+    assert process.returncode != 0 and "Signal 9 (SIGKILL)" in output, output
     steps = [row["global_step"] for row in read_metrics(folder) if row["kind"] == "train"]
     assert steps == list(range(320, steps[-1] + 1, 320)), "no row twice, none missing"
     assert ppo.load_checkpoint(folder / "last.pt")["global_step"] >= steps[-1] - 320
