@@ -247,6 +247,8 @@ def main(argv: list[str]) -> None:
         write_table(rows, options.out.with_name("README.md"))
         draw_curves(rows, options.out.with_suffix(".png"))
         return
+    if options.at_once > 1:  # else threads that wait for each other take time from the other run
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
     further_flags = shlex.join(options.flags)
     done = {(row["recipe"], row["seed"]) for row in rows if row["further_flags"] == further_flags}
     wanted = [(recipe, seed) for seed in options.seeds for recipe in options.recipes]
