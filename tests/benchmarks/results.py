@@ -126,7 +126,7 @@ def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict
         task=about["args"]["env_id"],
         further_flags=shlex.join(flags),
         seed=seed,
-        flags=about["args"],
+        flags=about["args"] | dict(resume=None),  # else a path of this machine, if the run was interrupted
         commit=commit,
         hardware=f"{about['device']}, {describe_processor()}",
         runs_at_once=num_at_once,
