@@ -17,23 +17,17 @@ pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 pick_cube_cpu() { tabletop --env_id PickCube-v1 --total_timesteps 800000 "$@"; }
 roll_ball_cpu() { tabletop --env_id RollBall-v1 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
+lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 800000 "$@"; }
+pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
+place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --total_timesteps 800000 "$@"; }
+stack_cube_cpu() { tabletop --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
+poke_cube_cpu() { tabletop --env_id PokeCube-v1 --total_timesteps 800000 "$@"; }
+pull_cube_tool_cpu() { tabletop --env_id PullCubeTool-v1 --total_timesteps 800000 "$@"; }
+peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timesteps 800000 "$@"; }
+two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
 push_to_goal_cpu() { tabletop --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 400000 "$@"; }
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
 curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
-
-# --- states, CPU: manipulation that starts with a grasp, in 800,000 steps ---
-
-# The fast standard deviation of the defaults shrinks before the gripper holds the object.
-grasping() { tabletop --logstd_lr_factor 1 "$@"; }
-
-lift_peg_upright_cpu() { grasping --env_id LiftPegUpright-v1 --total_timesteps 800000 "$@"; }
-pick_cube_so100_cpu() { grasping --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
-place_sphere_cpu() { grasping --env_id PlaceSphere-v1 --total_timesteps 800000 "$@"; }
-stack_cube_cpu() { grasping --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
-poke_cube_cpu() { grasping --env_id PokeCube-v1 --total_timesteps 800000 "$@"; }
-pull_cube_tool_cpu() { grasping --env_id PullCubeTool-v1 --total_timesteps 800000 "$@"; }
-peg_insertion_side_cpu() { grasping --env_id PegInsertionSide-v1 --total_timesteps 800000 "$@"; }
-two_robot_pick_cube_cpu() { grasping --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
 
 # --- states, CPU: control over hundreds of steps ---
 
