@@ -17,11 +17,11 @@ pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 pick_cube_cpu() { tabletop --env_id PickCube-v1 --total_timesteps 800000 "$@"; }
 roll_ball_cpu() { tabletop --env_id RollBall-v1 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
-lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 800000 "$@"; }
+lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 1200000 "$@"; }
 pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
-place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --total_timesteps 800000 "$@"; }
+place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --total_timesteps 1200000 "$@"; }
 stack_cube_cpu() { tabletop --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
-poke_cube_cpu() { tabletop --env_id PokeCube-v1 --total_timesteps 800000 "$@"; }
+poke_cube_cpu() { tabletop --env_id PokeCube-v1 --total_timesteps 1200000 "$@"; }
 pull_cube_tool_cpu() { tabletop --env_id PullCubeTool-v1 --total_timesteps 800000 "$@"; }
 peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timesteps 800000 "$@"; }
 two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
