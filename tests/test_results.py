@@ -41,7 +41,7 @@ def project(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_row_of_the_table(project, capsys):
     out = project / "results.jsonl"
-    command = ["--recipes", "push_cube_cpu", "--seeds", "2", "--out", str(out), "--flags", FLAGS]
+    command = ["--recipes", "push_cube_cpu", "--seeds", "2", "--out", str(out), f"--flags={FLAGS}"]
     results.main(command)
     (row,) = map(json.loads, out.read_text().splitlines())
     assert (row["recipe"], row["task"], row["seed"], row["steps"]) == ("push_cube_cpu", "PushCube-v1", 2, 640)

@@ -4,7 +4,7 @@ best.pt and last.pt on 256 other episodes, and appends a row a run to results.js
     python tests/benchmarks/results.py                                    # all that is missing; takes days
     python tests/benchmarks/results.py --recipes push_cube_cpu --seeds 1 2 3 4 5
     python tests/benchmarks/results.py --at_once 2        # shorter in all; each run's own minutes are upper bounds then
-    python tests/benchmarks/results.py --recipes push_cube_cpu --flags "--no-partial_reset"     # rows of their own
+    python tests/benchmarks/results.py --recipes push_cube_cpu --flags="--no-partial_reset"     # rows of their own
     python tests/benchmarks/results.py --table              # writes the table in README.md here, and results.png
 
 Stop it at any time: it skips the rows that are there, and resumes a run that was interrupted. To repeat one row:
@@ -237,7 +237,7 @@ def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipes", nargs="+", choices=find_recipes(), default=find_recipes())
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--flags", type=shlex.split, default=[], help="further flags of the script")
+    parser.add_argument("--flags", type=shlex.split, default=[], help='further flags of the script, as --flags="--a --b"')
     parser.add_argument("--at_once", type=int, default=1, help="runs that share this machine's cores")
     parser.add_argument("--out", type=Path, default=FOLDER / "results.jsonl")
     parser.add_argument("--table", action="store_true", help="run nothing: write the table and the picture")
