@@ -237,7 +237,7 @@ def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipes", nargs="+", choices=find_recipes(), default=find_recipes())
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--flags", type=shlex.split, default=[], help='further flags of the script, as --flags="--a --b"')
+    parser.add_argument("--flags", type=shlex.split, default=[], help='of the script, as --flags="--a --b"')
     parser.add_argument("--at_once", type=int, default=1, help="runs that share this machine's cores")
     parser.add_argument("--out", type=Path, default=FOLDER / "results.jsonl")
     parser.add_argument("--table", action="store_true", help="run nothing: write the table and the picture")
