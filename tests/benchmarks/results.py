@@ -179,12 +179,12 @@ def write_table(rows: list[dict], path: Path) -> None:
     """Replace the table in this file."""
     names = ("recipe", "task", "steps", "seeds", "minutes", "success once", "success at end", "return", "last policy")
     table = [(*names, "90% after"), ["---"] * 10]
-    groups, num_solved = group(rows), 0
+    groups, solved = group(rows), set()
     for name, runs in groups.items():
         name = f"`{name}`"
         if len(runs) >= 3 and all(map(is_solved, runs)):
             name = f"**{name}**"
-            num_solved += 1
+            solved.add(runs[0]["recipe"])
         line = [
             name,
             runs[0]["task"].rpartition(":")[2],
@@ -202,7 +202,8 @@ def write_table(rows: list[dict], path: Path) -> None:
     text = path.read_text()
     before, after = text.partition(TABLE_STARTS)[0], text.partition(TABLE_ENDS)[2]
     path.write_text("\n".join([before + TABLE_STARTS, "", *lines, "", TABLE_ENDS]) + after)
-    print(f"{path}: {len(groups)} recipes, {num_solved} solved with every seed")
+    recipes = {row["recipe"] for row in rows}
+    print(f"{path}: {len(recipes)} recipes, {len(solved)} solved with every seed")
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
