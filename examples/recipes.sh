@@ -15,7 +15,7 @@ tabletop() { python ppo.py --no-cuda --eval_freq 20 "$@"; }
 push_cube_cpu() { tabletop --env_id PushCube-v1 --eval_freq 10 "$@"; }
 pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 pick_cube_cpu() { tabletop --env_id PickCube-v1 --total_timesteps 800000 "$@"; }
-roll_ball_cpu() { tabletop --env_id RollBall-v1 --total_timesteps 800000 "$@"; }
+roll_ball_cpu() { tabletop --env_id RollBall-v1 --gamma 0.95 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
 lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 1200000 "$@"; }
 pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
