@@ -246,7 +246,7 @@ class EvaluationArgs:
     evaluate: bool = False
     """only evaluate --checkpoint, with the task, the network and the flags of its run"""
     checkpoint: Optional[str] = None
-    """checkpoint to evaluate, or whose weights training starts from"""
+    """checkpoint to evaluate, or whose weights, moments and learning rates training starts from"""
     save_model: bool = True
     """write best.pt (the best evaluation so far) and last.pt"""
     save_freq: Optional[int] = None
@@ -497,7 +497,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     device, run_dir = start_processes(args, closing)
     args = gather(args)[0]  # all processes need the same; defaults depend on the machine
     local = local_args(args)  # this process's part of the environments
-    resumed = load_checkpoint(args.resume) if args.resume else {}
+    path = args.resume or args.checkpoint
+    loaded = load_checkpoint(path) if path else {}
+    resumed = loaded if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     torch.set_num_threads(1)  # idle threads would spin on cores that the simulation needs
 
@@ -510,13 +512,13 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
 
     seed_all(args.seed)  # the same weights, whatever the environments drew
     agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
-    if resumed or args.checkpoint:
-        load_weights(agent, resumed or load_checkpoint(args.checkpoint), args.resume or args.checkpoint)
+    if loaded:
+        load_weights(agent, loaded, path)
     if WORLD_SIZE > 1:  # machines may turn the same seed into different weights
         agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
     optimizer = make_optimizer(agent, args, device)
-    if resumed:
-        load_optimizer(optimizer, resumed["optimizer"])
+    if loaded:  # a trained policy is narrow: the initial learning rate would wreck it before it is adapted
+        load_optimizer(optimizer, loaded["optimizer"])
 
     # --- storage: where the environments are; a learner on another device copies it, and its actors copy the agent
     shape = (args.num_steps, local.num_envs)
@@ -1530,7 +1532,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
     flags = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
     optimizer.load_state_dict(saved)
     for group, flag in zip(optimizer.param_groups, flags):
-        if group["initial_lr"] == flag["initial_lr"]:
+        if group["adapts"] and flag["adapts"] and group["initial_lr"] == flag["initial_lr"]:
             flag["lr"].copy_(group["lr"])
         group.update(flag)
 

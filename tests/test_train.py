@@ -190,6 +190,22 @@ def test_learning_rate_follows_the_divergence(run, desired_kl, reached, anneal_l
     assert factors == reached
 
 
+def test_training_from_a_checkpoint(run):
+    """It goes on with the weights, Adam's moments and the adapted learning rates, and counts steps from zero: with the
+    initial learning rate, the first updates would wreck a policy whose standard deviation has shrunk."""
+    first = run(desired_kl=1e-9, exp_name="first")
+    saved = first.checkpoint("last.pt")
+    second = run(desired_kl=1e-9, exp_name="second", checkpoint=str(first.folder / "last.pt"))
+    begins = second.iterations[0]
+    assert all(torch.equal(value, saved["agent"][name]) for name, value in begins["before"].items())
+    rates = [float(group["lr"]) for group in saved["optimizer"]["param_groups"]]
+    assert begins["updates"][0]["rates"] == rates and rates[0] < ARGS.learning_rate / 10
+    ended = second.checkpoint("last.pt")
+    for name, moments in saved["optimizer"]["state"].items():
+        assert ended["optimizer"]["state"][name]["step"] == 2 * moments["step"] > 0
+    assert ended["global_step"] == saved["global_step"] == ARGS.total_timesteps
+
+
 def test_normalization_follows_the_update(run):
     """An update uses the same statistics as its rollout. After it, the statistics cover all data so far."""
     record = run(norm_obs=True)
