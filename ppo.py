@@ -246,7 +246,7 @@ class EvaluationArgs:
     evaluate: bool = False
     """only evaluate --checkpoint, with the task, the network and the flags of its run"""
     checkpoint: Optional[str] = None
-    """checkpoint to evaluate, or whose weights, moments and learning rates training starts from"""
+    """checkpoint to evaluate, or to start training from (with its weights, Adam's moments and learning rates)"""
     save_model: bool = True
     """write best.pt (the best evaluation so far) and last.pt"""
     save_freq: Optional[int] = None
@@ -517,7 +517,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
     if WORLD_SIZE > 1:  # machines may turn the same seed into different weights
         agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
     optimizer = make_optimizer(agent, args, device)
-    if loaded:  # a trained policy is narrow: the initial learning rate would wreck it before it is adapted
+    if loaded:  # the initial learning rate would wreck a policy whose standard deviation has shrunk
         load_optimizer(optimizer, loaded["optimizer"])
 
     # --- storage: where the environments are; a learner on another device copies it, and its actors copy the agent

@@ -104,7 +104,7 @@ def test_rows_are_of_todays_recipes(run_recipe):
     rows = results.read_rows(results.FOLDER / "results.jsonl")
     keys = [(row["recipe"], row["further_flags"], row["seed"]) for row in rows]
     assert len(set(keys)) == len(keys), "a row must not be there twice"
-    of_the_run = {"seed", "exp_name", "capture_video", "resume"}
+    of_the_run = {"seed", "exp_name", "capture_video"}
     of_the_machine = {"num_envs", "num_eval_envs", "num_steps", "num_actors", "shader"}
     for row in rows:
         (script, *flags), _ = run_recipe(row["recipe"], *shlex.split(row["further_flags"]))

@@ -1,7 +1,7 @@
 """Training throughput of ppo.py with different numbers of processes of torchrun, one GPU each.
 
     uv run tests/benchmarks/ranks.py --ranks 1 2 4 8
-    uv run tests/benchmarks/ranks.py --ranks 1 2 --num_envs 8 --flags "--no-cuda --num_steps 100"     # on a CPU
+    uv run tests/benchmarks/ranks.py --ranks 1 2 --num_envs 8 --flags="--no-cuda --num_steps 100"     # on a CPU
 
 Each process has `--num_envs` environments, so the work grows with the number of processes. The numbers take turns, with
 several repetitions each, because the speed of a shared machine drifts: compare ratios. On a machine without a GPU, the

@@ -182,6 +182,8 @@ def write_table(rows: list[dict], path: Path) -> None:
     groups, solved = group(rows), set()
     for name, runs in groups.items():
         name = f"`{name}`"
+        steps_to_nine_tenths = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
+        all_rose = all(max(value for _, _, value in run["curve"]) > 0 for run in runs)
         if len(runs) >= 3 and all(map(is_solved, runs)):
             name = f"**{name}**"
             solved.add(runs[0]["recipe"])
@@ -195,7 +197,7 @@ def write_table(rows: list[dict], path: Path) -> None:
             join_seeds(runs, "best", "success_at_end"),
             join_seeds(runs, "best", "return"),
             join_seeds(runs, "last", main_metric(runs[0]["last"])),
-            f"{statistics.median(run['steps_to_nine_tenths_of_the_best'] for run in runs):,.0f}",
+            f"{statistics.median(steps_to_nine_tenths):,.0f}" if all_rose else "",
         ]
         table.append(line)
     lines = [f"| {' | '.join(line)} |" for line in table]
@@ -238,7 +240,7 @@ def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipes", nargs="+", choices=find_recipes(), default=find_recipes())
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--flags", type=shlex.split, default=[], help='of the script, as --flags="--a --b"')
+    parser.add_argument("--flags", type=shlex.split, default=[], help='further flags, as --flags="--a --b"')
     parser.add_argument("--at_once", type=int, default=1, help="runs that share this machine's cores")
     parser.add_argument("--out", type=Path, default=FOLDER / "results.jsonl")
     parser.add_argument("--table", action="store_true", help="run nothing: write the table and the picture")
