@@ -71,12 +71,12 @@ def test_a_row_of_the_table(project, capsys):
     assert (project / "results.png").stat().st_size > 10_000
 
 
-def make_row(recipe, seed, success=None, reward=0.5, steps=3):
+def make_row(recipe, seed, success=None, reward=0.5):
     metrics = dict(episode_len=[1000.0])
     metrics["return"] = [1000 * reward, 0.0, 1000.0]
     if success is not None:
         metrics |= dict(success_once=[success, 0.0, 1.0], success_at_end=[success / 2, 0.0, 1.0])
-    curve = [[100 * i, 60.0 * i, reward] for i in range(steps)]
+    curve = [[100 * i, 60.0 * i, reward * i] for i in range(3)]
     return dict(
         recipe=recipe, further_flags="", seed=seed, task="Task", steps=200, training_seconds=120.0, runs_at_once=seed,
         best=metrics, last=metrics, steps_to_nine_tenths_of_the_best=100, curve=curve,
@@ -96,7 +96,21 @@ def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
     assert "5 recipes, 2 solved" in capsys.readouterr().out
     bold = [line for line in path.read_text().splitlines() if "**" in line]
     assert len(bold) == 2 and "`push_cube_cpu`" in bold[0] and "810" in bold[1]
+    assert bold[0].endswith("| 100 |")
     assert "| 0.90, 0.95, 0.91 |" in bold[0] and "| 2.0, ≤ 2.0, ≤ 2.0 |" in bold[0]
+
+
+def test_steps_are_given_only_where_every_run_learned(tmp_path):
+    """Else the table would give the step of an evaluation that was better by chance."""
+    path = tmp_path / "README.md"
+    path.write_text(f"{results.TABLE_STARTS}\n{results.TABLE_ENDS}\n")
+    rows = [make_row("push_cube_cpu", seed, 0.5) for seed in (1, 2)]
+    rows[1]["curve"] = [[0, 0.0, 0.06], [100, 60.0, 0.12]]
+    results.write_table(rows, path)
+    assert "| 100 |" not in path.read_text()
+    rows[1]["curve"][1][2] = 0.13
+    results.write_table(rows, path)
+    assert "| 100 |" in path.read_text()
 
 
 def test_rows_are_of_todays_recipes(run_recipe):

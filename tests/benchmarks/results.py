@@ -163,6 +163,12 @@ def is_solved(row: dict) -> bool:
     return best["return"][0] >= 0.8 * best["episode_len"][0]
 
 
+def has_learned(row: dict) -> bool:
+    """An evaluation was more than twice as good as that of the untrained policy; less may be chance."""
+    values = [value for _, _, value in row["curve"]]
+    return max(values) > 2 * values[0]
+
+
 def join_seeds(runs: list[dict], policy: str, metric: str) -> str:
     """The means of the runs' evaluations, in the order of the seeds; nothing if the task does not have the metric."""
     means = [run[policy][metric][0] for run in runs if metric in run[policy]]
@@ -183,7 +189,7 @@ def write_table(rows: list[dict], path: Path) -> None:
     for name, runs in groups.items():
         name = f"`{name}`"
         steps_to_nine_tenths = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
-        all_rose = all(max(value for _, _, value in run["curve"]) > 0 for run in runs)
+        all_learned = all(has_learned(run) for run in runs)
         if len(runs) >= 3 and all(map(is_solved, runs)):
             name = f"**{name}**"
             solved.add(runs[0]["recipe"])
@@ -197,7 +203,7 @@ def write_table(rows: list[dict], path: Path) -> None:
             join_seeds(runs, "best", "success_at_end"),
             join_seeds(runs, "best", "return"),
             join_seeds(runs, "last", main_metric(runs[0]["last"])),
-            f"{statistics.median(steps_to_nine_tenths):,.0f}" if all_rose else "",
+            f"{statistics.median(steps_to_nine_tenths):,.0f}" if all_learned else "",
         ]
         table.append(line)
     lines = [f"| {' | '.join(line)} |" for line in table]
