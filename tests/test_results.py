@@ -83,10 +83,16 @@ def make_row(recipe, seed, success=None, reward=0.5):
     )  # fmt: skip
 
 
-def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
-    """By success where the task has it, else by the return."""
+@pytest.fixture
+def path(tmp_path):
+    """A file for the table."""
     path = tmp_path / "README.md"
     path.write_text(f"{results.TABLE_STARTS}\n{results.TABLE_ENDS}\n")
+    return path
+
+
+def test_a_task_is_solved_if_every_seed_solves_it(path, capsys):
+    """By success where the task has it, else by the return."""
     rows = [make_row("push_cube_cpu", seed, success) for seed, success in ((2, 0.95), (1, 0.9), (3, 0.91))]
     rows += [make_row("pick_cube_cpu", seed, success) for seed, success in ((1, 0.95), (2, 0.89), (3, 1))]
     rows += [make_row("lift_peg_upright_cpu", seed, 1.0) for seed in (1, 2)]  # a seed is missing
@@ -100,10 +106,8 @@ def test_a_task_is_solved_if_every_seed_solves_it(tmp_path, capsys):
     assert "| 0.90, 0.95, 0.91 |" in bold[0] and "| 2.0, ≤ 2.0, ≤ 2.0 |" in bold[0]
 
 
-def test_steps_are_given_only_where_every_run_learned(tmp_path):
+def test_steps_are_given_only_where_every_run_learned(path):
     """Else the table would give the step of an evaluation that was better by chance."""
-    path = tmp_path / "README.md"
-    path.write_text(f"{results.TABLE_STARTS}\n{results.TABLE_ENDS}\n")
     rows = [make_row("push_cube_cpu", seed, 0.5) for seed in (1, 2)]
     rows[1]["curve"] = [[0, 0.0, 0.06], [100, 60.0, 0.12]]
     results.write_table(rows, path)
