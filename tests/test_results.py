@@ -108,13 +108,15 @@ def test_a_task_is_solved_if_every_seed_solves_it(path, capsys):
 
 def test_steps_are_given_only_where_every_run_learned(path):
     """Else the table would give the step of an evaluation that was better by chance."""
-    rows = [make_row("push_cube_cpu", seed, 0.5) for seed in (1, 2)]
-    rows[1]["curve"] = [[0, 0.0, 0.06], [100, 60.0, 0.12]]
-    results.write_table(rows, path)
-    assert "| 100 |" not in path.read_text()
-    rows[1]["curve"][1][2] = 0.13
-    results.write_table(rows, path)
-    assert "| 100 |" in path.read_text()
+    rates = [make_row("push_cube_cpu", seed, 0.5) for seed in (1, 2)]
+    returns = [make_row("cartpole_balance_cpu", seed) for seed in (1, 2)]
+    for rows, first, too_little, enough in ((rates, 0.0, 0.19, 0.2), (returns, 300, 600, 601)):
+        rows[1]["curve"] = [[0, 0.0, first], [100, 60.0, too_little]]
+        results.write_table(rows, path)
+        assert "| 100 |" not in path.read_text()
+        rows[1]["curve"][1][2] = enough
+        results.write_table(rows, path)
+        assert "| 100 |" in path.read_text()
 
 
 def test_rows_are_of_todays_recipes(run_recipe):
