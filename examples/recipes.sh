@@ -44,7 +44,7 @@ cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timeste
 # These robots have more joints: with the default learning rate, each update moves the policy too far.
 locomotion() { control --learning_rate 3e-4 "$@"; }
 
-hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 800000 "$@"; }
+hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 2000000 "$@"; }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
 humanoid_stand_cpu() { locomotion --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
