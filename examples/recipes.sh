@@ -17,7 +17,7 @@ pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --total_timesteps 1200000 "$@"; }
 pick_cube_cpu() { tabletop --env_id PickCube-v1 --total_timesteps 800000 "$@"; }
 pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
-place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --total_timesteps 1200000 "$@"; }
+place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --total_timesteps 1800000 "$@"; }
 stack_cube_cpu() { tabletop --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
 poke_cube_cpu() { tabletop --env_id PokeCube-v1 --total_timesteps 1200000 "$@"; }
 # The ball rolls on alone, so its reward comes late: ManiSkill's own gamma for this task.
@@ -67,7 +67,7 @@ cartpole_balance_images_and_state_cpu() {
 # The camera looks closer: at 64 pixels the task's own camera shows the pole half a pixel wide.
 cartpole_balance_images_cpu() {
     images --env_id MS-CartpoleBalance-v1 --no-include_state --frame_stack 3 \
-        --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --gamma 0.99 --gae_lambda 0.95 --total_timesteps 72000 \
+        --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --gamma 0.99 --gae_lambda 0.95 --total_timesteps 144000 \
         --num_eval_episodes 8 --eval_freq 15 "$@"
 }
 
