@@ -109,4 +109,4 @@ if [ $# = 0 ] || ! grep -qxF -- "$1" <<<"$recipes"; then
     echo "usage: bash examples/recipes.sh NAME [flags]; names:" $recipes >&2
     exit 2
 fi
-"$@"
+"$@"; exit # here, so that bash reads no further if you edited this file meanwhile
