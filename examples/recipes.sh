@@ -41,13 +41,13 @@ control() {
 
 cartpole_balance_cpu() { control --env_id MS-CartpoleBalance-v1 --total_timesteps 96000 "$@"; }
 cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timesteps 400000 "$@"; }
+humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
-# These robots have more joints: with the default learning rate, each update moves the policy too far.
+# Legs: with the default learning rate, each update moves the policy too far. (The humanoid has not been run with this.)
 locomotion() { control --learning_rate 3e-4 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 2000000 "$@"; }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
-humanoid_stand_cpu() { locomotion --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
 # --- states, CPU: in hand ---
 
