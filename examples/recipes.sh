@@ -43,7 +43,7 @@ cartpole_balance_cpu() { control --env_id MS-CartpoleBalance-v1 --total_timestep
 cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timesteps 400000 "$@"; }
 humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
-# Legs: with the default learning rate, each update moves the policy too far. (The humanoid has not been run with this.)
+# Legs: with the default learning rate, each update moves the policy too far. The humanoid stands no better with this.
 locomotion() { control --learning_rate 3e-4 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 2000000 "$@"; }
