@@ -43,7 +43,8 @@ cartpole_balance_cpu() { control --env_id MS-CartpoleBalance-v1 --total_timestep
 cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timesteps 400000 "$@"; }
 humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
-# Legs: with the default learning rate, each update moves the policy too far. The humanoid stands no better with this.
+# Robots with legs: with the default learning rate, each update moves the policy too far. The humanoid is not here,
+# because it stands no better with this.
 locomotion() { control --learning_rate 3e-4 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 2000000 "$@"; }
@@ -58,19 +59,18 @@ rotate_cube_cpu() {
 
 # --- images, CPU ---
 
-images() { python ppo_rgb.py --no-cuda --camera_width 64 --camera_height 64 "$@"; }
-
-cartpole_balance_images_and_state_cpu() {
-    images --env_id MS-CartpoleBalance-v1 --gamma 0.99 --gae_lambda 0.95 --total_timesteps 48000 \
+images() {
+    python ppo_rgb.py --no-cuda --camera_width 64 --camera_height 64 --gamma 0.99 --gae_lambda 0.95 \
         --num_eval_episodes 8 --eval_freq 15 "$@"
 }
+
+cartpole_balance_images_and_state_cpu() { images --env_id MS-CartpoleBalance-v1 --total_timesteps 48000 "$@"; }
 
 # The camera looks closer: at 64 pixels the task's own camera shows the pole half a pixel wide. Policy and value share
 # the network of the images: with returns of up to 100, the gradient of the value would drown the policy's.
 cartpole_balance_images_cpu() {
     images --env_id MS-CartpoleBalance-v1 --no-include_state --frame_stack 3 \
-        --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --gamma 0.99 --gae_lambda 0.95 --reward_scale 0.1 \
-        --total_timesteps 72000 --num_eval_episodes 8 --eval_freq 15 "$@"
+        --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --reward_scale 0.1 --total_timesteps 72000 "$@"
 }
 
 # --- states, GPU ---

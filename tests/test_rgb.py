@@ -118,7 +118,7 @@ def test_a_batch_sees_what_single_environments_see(env_id, robot):
         row = {kind: {name: x[i : i + 1] for name, x in states.items()} for kind, states in state.items()}
         return singles[i].reset(options=dict(reset_to_env_states=dict(env_states=row)))[0]
 
-    generator = torch.Generator().manual_seed(0)  # with others, a scene may move by less than a pixel
+    generator = torch.Generator().manual_seed(0)  # with other actions, a scene may move by less than a pixel
     obs, _ = batch.reset(seed=[1, 2, 3])
     expected = [start(i) for i in range(3)]
     assert len({obs["rgb"][i].float().mean().item() for i in range(3)}) == 3, "no two look the same"
