@@ -44,13 +44,12 @@ cartpole_swing_up_cpu() { control --env_id MS-CartpoleSwingUp-v1 --total_timeste
 humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 300000 "$@"; }
 
 # Robots with legs: with the default learning rate, each update moves the policy too far. Without the bonus for entropy,
-# the standard deviation shrinks before the hopper has stood up once. The humanoid is not here, because it stands no
-# better with the lower learning rate.
+# the hopper may stop exploring before it has stood up once. The humanoid is not here, because it stands no better with
+# the lower learning rate.
 locomotion() { control --learning_rate 3e-4 --ent_coef 0.01 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 2000000 "$@"; }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
-ant_run_cpu() { locomotion --env_id MS-AntRun-v1 --total_timesteps 2000000 "$@"; }
 
 # --- states, CPU: in hand ---
 
