@@ -50,8 +50,6 @@ locomotion() { control --learning_rate 3e-4 --ent_coef 0.01 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 3000000 "$@"; }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
-# Its reward is there from the start: with the bonus, the entropy rises until the ant no longer runs.
-ant_run_cpu() { locomotion --env_id MS-AntRun-v1 --ent_coef 0 --total_timesteps 2000000 "$@"; }
 
 # --- states, CPU: in hand ---
 
