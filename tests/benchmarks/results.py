@@ -234,7 +234,7 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         values = [points[steps] for steps in x]
         axis.fill_between(x, [min(v) for v in values], [max(v) for v in values], alpha=0.3)
         axis.plot(x, [statistics.mean(v) for v in values])
-        axis.set_title(name.replace("_cpu", ""), fontsize=8)
+        axis.set_title(name.replace("_cpu", "").replace(" --", "\n--"), fontsize=8)
         axis.tick_params(labelsize=7)
         is_rate = "success_once" in runs[0]["best"]
         axis.set_ylim(0, 1.03 if is_rate else None)
