@@ -35,6 +35,12 @@ exploring() { tabletop --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
 
 lift_peg_upright_cpu() { exploring --env_id LiftPegUpright-v1 "$@"; }
 
+# A small arm that moves slowly: a larger gamma, and a controller that adds actions to its target, not to where the arm
+# hangs.
+so100() { tabletop --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 "$@"; }
+
+grasp_cube_so100_cpu() { so100 --env_id SO100GraspCube-v1 --total_timesteps 2400000 "$@"; }
+
 # --- states, CPU: control over hundreds of steps ---
 
 # With the adaptive learning rate and the fast standard deviation of the defaults, the policy explores too little.
