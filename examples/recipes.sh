@@ -36,8 +36,11 @@ exploring() { tabletop --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
 lift_peg_upright_cpu() { exploring --env_id LiftPegUpright-v1 "$@"; }
 
 # The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. The cube has
-# far to go, so gamma is larger.
-so100() { tabletop --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 "$@"; }
+# far to go, so gamma is larger. Training episodes go on after success: if they ended, the arm would learn to stay where
+# success begins, and often stop short of it.
+so100() {
+    tabletop --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 --no-partial_reset "$@"
+}
 
 grasp_cube_so100_cpu() { so100 --env_id SO100GraspCube-v1 --total_timesteps 2400000 "$@"; }
 
