@@ -30,19 +30,16 @@ push_to_goal_cpu() { tabletop --env_id examples.push_to_goal:PushToGoal-v1 --tot
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
 curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
 
-# Where success comes late: without the bonus for entropy, the policy may stop exploring before its first success.
-exploring() { tabletop --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
-
-lift_peg_upright_cpu() { exploring --env_id LiftPegUpright-v1 "$@"; }
+# Success comes late: without the bonus for entropy, the policy may stop exploring before its first success.
+lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
 
 # The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. The cube has
-# far to go, so gamma is larger. Training episodes go on after success: if they ended, the arm would learn to stay where
-# success begins, and often stop short of it.
-so100() {
-    tabletop --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 --no-partial_reset "$@"
+# far to go, so gamma is larger. Training episodes go on after success: if they ended, the arm would learn to go
+# just far enough, and often stop short.
+grasp_cube_so100_cpu() {
+    tabletop --env_id SO100GraspCube-v1 --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 \
+        --no-partial_reset --total_timesteps 2400000 "$@"
 }
-
-grasp_cube_so100_cpu() { so100 --env_id SO100GraspCube-v1 --total_timesteps 2400000 "$@"; }
 
 # --- states, CPU: control over hundreds of steps ---
 
