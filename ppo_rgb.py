@@ -33,7 +33,6 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
-import io
 import json
 import math
 import os
@@ -44,6 +43,7 @@ import shlex
 import shutil
 import signal
 import sys
+import sysconfig
 import tempfile
 import threading
 import time
@@ -52,8 +52,8 @@ import warnings
 from collections import Counter, defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, make_dataclass, replace
-from functools import partialmethod
+from dataclasses import asdict, dataclass, replace
+from functools import partial, partialmethod
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
@@ -66,15 +66,15 @@ import imageio
 import numpy as np
 import psutil
 import sapien
+import sapien.wrapper.urdf_loader
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
 from sapien import physx
 from torch.distributions import Normal
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map
 from tqdm import tqdm
 
 
@@ -88,6 +88,17 @@ def find_render_device() -> Optional[sapien.Device]:
 
 
 RENDER_DEVICE = find_render_device()
+if RENDER_DEVICE is None:
+    # Tasks create render materials even if nothing is rendered, and SAPIEN creates none without a Vulkan device.
+    # Training from states needs no picture: these stand-ins accept every call, so that the tasks can be built.
+    class InertRenderObject:
+        __init__ = lambda self, *args, **kwargs: None
+        __getattr__ = lambda self, name: lambda *args, **kwargs: None
+
+    for module in [*sys.modules.values()]:  # of SAPIEN, and of ManiSkill if it was imported earlier
+        for name in ("RenderMaterial", "RenderTexture2D"):
+            if name in getattr(module, "__dict__", {}):
+                setattr(module, name, InertRenderObject)
 
 import mani_skill.envs  # registers the tasks
 import mani_skill.envs.sapien_env as sapien_env
@@ -102,7 +113,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Link
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.visualization.misc import tile_images
-from mani_skill.utils.wrappers.flatten import FlattenActionSpaceWrapper, FlattenRGBDObservationWrapper
+from mani_skill.utils.wrappers import flatten
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
@@ -112,8 +123,10 @@ RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RAN
 WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
 
 
+# ----- Flags ----------------------------------------------------------------------------------------------------------
 @dataclass
-class ExperimentArgs:
+class Args:
+    # --- Experiment ---
     exp_name: Optional[str] = None
     """name of the run; its files go to runs/<exp_name> (None: <env_id>__<script>__<seed>__<time>)"""
     seed: int = 1
@@ -131,9 +144,7 @@ class ExperimentArgs:
     wandb_group: str = "PPO"
     """Weights & Biases group"""
 
-
-@dataclass
-class EnvironmentArgs:
+    # --- Environment ---
     env_id: str = "PushCube-v1"
     """the task: any registered ManiSkill task, or module:EnvId for your own"""
     obs_mode: str = "rgb"
@@ -177,9 +188,7 @@ class EnvironmentArgs:
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"sensor_configs": {"fov": 0.6}}'"""
 
-
-@dataclass
-class PPOArgs:
+    # --- PPO ---
     total_timesteps: int = 10_000_000
     """total number of environment steps"""
     learning_rate: float = 3e-4
@@ -235,9 +244,7 @@ class PPOArgs:
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
 
-
-@dataclass
-class EvaluationArgs:
+    # --- Evaluation, checkpoints, videos ---
     eval_freq: int = 25
     """evaluate every so many iterations, and always before the first and after the last (0: only then)"""
     num_eval_episodes: int = 64
@@ -271,17 +278,12 @@ class EvaluationArgs:
     save_trajectory: bool = False
     """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor"""
 
-
-@dataclass
-class RuntimeArgs:
+    # --- Speed ---
     compile: bool = False
     """compile the network with torch.compile, which takes a minute"""
     cudagraphs: bool = True
     """on a GPU, launch a step of the policy, and an epoch of the update, as one CUDA graph"""
 
-
-@dataclass
-class Args(RuntimeArgs, EvaluationArgs, PPOArgs, EnvironmentArgs, ExperimentArgs):
     @property
     def batch_size(self) -> int:
         return self.num_envs * self.num_steps
@@ -300,10 +302,147 @@ CPU_DEFAULTS = dict(
     total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
     target_kl=0.1, eval_freq=50, num_eval_episodes=16,
 )  # fmt: skip
-TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
 CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
+UPDATE_THREADS_PER_CORE = 1.0  # in ppo.py, with its small layers, half of them are faster
+TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
+
+# These fix the task and the network: a resumed run cannot change them, and --checkpoint brings them along.
+FIXED_FLAGS = (
+    "env_id", "obs_mode", "control_mode", "robot_uids", "reward_mode", "env_kwargs", "eval_partial_reset", "norm_obs",
+    "include_state", "frame_stack", "camera_width", "camera_height", "shader", "encoder",
+)  # fmt: skip
+
+LIMITS = (  # of numbers, if given; none may be infinite or not a number
+    (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
+              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq "
+              "reconfiguration_freq eval_reconfiguration_freq"),
+    (0, 1, "gamma gae_lambda stop_at_success"),
+    (0, 2**30, "eval_seed"),
+    (-20, 5, "logstd_init"),
+    (1, 32, "frame_stack"),
+    (8, 4096, "camera_width camera_height"),
+    (0, 32, "random_shift"),
+)  # fmt: skip
+
+# best.pt is of the evaluation with the highest first number; if that is equal, the second one decides
+BEST_BY = ("success_once", "return")
 
 
+# ----- Environment ----------------------------------------------------------------------------------------------------
+def check_observations(args: Args) -> None:
+    """Refuse images that do not exist, or that nothing can render."""
+    textures = args.obs_mode.split("+")
+    if not all(k in TEXTURES for k in textures) or len(set(textures)) < len(textures):
+        fail(f"--obs_mode {args.obs_mode}: must be some of {', '.join(TEXTURES)}, joined by +")
+    if args.shader == "minimal" and ("normal" in textures or "albedo" in textures):
+        fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
+    if args.render_backend == "none":
+        fail("--render_backend none: images must be rendered; ppo.py learns from the state")
+    if find_render_error(args):
+        fail(f"{find_render_error(args)}; ppo.py learns from the state")
+
+
+class ImageObservations(flatten.FlattenRGBDObservationWrapper):
+    """Observations as a dict: "state", if included, float32 (num_envs, state_dim), and each texture of `obs_mode`:
+    (num_envs, height, width, channels of all cameras and frames), in the dtype in which it is rendered (uint8 colours,
+    int16 millimetres and ids, float32 normals). ManiSkill's wrapper supports colours and depth. This one adds the other
+    textures, frame stacking that survives partial resets, and videos of what the policy sees."""
+
+    def __init__(self, env: gym.Env, args: Args):
+        textures = args.obs_mode.split("+")
+        self.others = [k for k in textures if k not in ("rgb", "depth")]
+        self.num_frames, self.frames, self.latest = args.frame_stack, {}, {}
+        cameras = env.unwrapped._init_raw_obs["sensor_data"].values()
+        if not cameras:
+            raise RunError("neither the task nor its robot has a camera; ppo.py learns from the state")
+        if len({x.shape[1:3] for camera in cameras for x in camera.values()}) > 1:
+            raise RunError("the sizes of the cameras differ: give --camera_width and --camera_height")
+        super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
+
+    def observation(self, observation: dict, new_episodes=None) -> dict:
+        cameras = observation["sensor_data"].values()
+        latest = super().observation(observation)
+        latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
+        if "segmentation" in latest:
+            latest["segmentation"] = latest["segmentation"].short()  # some shaders give 64 bits
+        # A GPU may render CPU simulation. With GPU simulation, the observation that defines the space is on the CPU.
+        latest = self.latest = {k: v.to(self.base_env.device) for k, v in latest.items()}
+        if self.num_frames == 1:
+            return dict(latest)
+        for k, frame in latest.items():
+            filled = torch.cat([frame] * self.num_frames, dim=-1)  # an episode starts with its first frame repeated
+            if new_episodes is not None and k in self.frames:
+                self.frames[k] = self.frames[k].index_copy(0, new_episodes, filled[new_episodes])
+            elif k in self.frames:
+                self.frames[k] = torch.cat([self.frames[k][..., frame.shape[-1] :], frame], dim=-1)
+            else:
+                self.frames[k] = filled
+        return dict(self.frames)
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = self.env.reset(seed=seed, options=options)
+        env_idx = (options or {}).get("env_idx", np.arange(self.base_env.num_envs))
+        return self.observation(obs, torch.as_tensor(env_idx, device=self.base_env.device)), info
+
+    def render(self) -> torch.Tensor:
+        """The scene, what the policy sees, or both, as render_mode asks: uint8 (num_envs, height, width, 3)."""
+        mode = self.base_env.render_mode
+        scene = None if mode == "sensors" else self.base_env.render_rgb_array()
+        if mode == "rgb_array":
+            return scene
+        views = []
+        for k, texture in self.latest.items():
+            for x in () if k == "state" else texture.split(TEXTURES[k], dim=-1):  # of each camera
+                if k == "depth":
+                    x = 255 * (x > 0) / (1 + x / 1000)
+                elif k == "segmentation":
+                    x = x.int() * torch.tensor([37, 91, 151], device=x.device) % 256
+                elif k == "position":
+                    x = 128 + x / 1000 * 64
+                elif k == "normal":
+                    x = (x + 1) * 127.5
+                views.append(x.clamp(0, 255).to(torch.uint8).expand(*x.shape[:-1], 3).permute(0, 3, 1, 2))
+        height = views[0].shape[2] if scene is None else scene.shape[1] // max(2, len(views))
+        views = [nn.functional.interpolate(v, size=(height, height * v.shape[3] // v.shape[2])) for v in views]
+        image = torch.cat(views, dim=2).permute(0, 2, 3, 1)
+        if scene is not None:
+            column = nn.functional.pad(image, (0, 0, 0, 0, 0, scene.shape[1] - image.shape[1]))
+            image = torch.cat([scene.to(column.device), column], dim=2)
+        # video codecs want multiples of 16
+        return nn.functional.pad(image, (0, 0, 0, -image.shape[2] % 16, 0, -image.shape[1] % 16))
+
+
+def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
+    """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
+    modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
+    render_backend = args.render_backend
+    if render_backend == "gpu" and args.sim_backend != "physx_cpu":
+        render_backend = args.sim_backend.replace("physx_cuda", "gpu")  # the GPU that simulates
+    kwargs = dict(
+        num_envs=num_envs,
+        obs_mode=args.obs_mode,
+        control_mode=args.control_mode,
+        robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
+        reward_mode=args.reward_mode or next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in modes),
+        reconfiguration_freq=0 if evaluation else args.reconfiguration_freq,  # `evaluate` rebuilds its scenes itself
+        sim_backend=args.sim_backend,
+        render_backend=render_backend,
+        render_mode=args.render_mode if film else None,
+    )
+    kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
+    needs_default = "normal" in args.obs_mode or "albedo" in args.obs_mode
+    shader = args.shader or ("default" if needs_default else "minimal")
+    cameras = dict(width=args.camera_width, height=args.camera_height, shader_pack=shader)
+    cameras = {k: v for k, v in cameras.items() if v is not None} | kwargs.get("sensor_configs", {})
+    env = ImageObservations(make_task(args.env_id, **kwargs | dict(sensor_configs=cameras)), args)
+    if isinstance(env.action_space, gym.spaces.Dict):
+        env = flatten.FlattenActionSpaceWrapper(env)
+    return env
+
+
+# ----- Agent ----------------------------------------------------------------------------------------------------------
 def layer_init(layer: nn.Module, std: float = math.sqrt(2), bias_const: float = 0.0) -> nn.Module:
     nn.init.orthogonal_(layer.weight, std)
     nn.init.constant_(layer.bias, bias_const)
@@ -421,10 +560,12 @@ class Agent(nn.Module):
 
     @torch.no_grad()
     def update_normalization(self, obs):
-        """Merge the mean and variance of a batch of observations into the running ones (Chan et al. 1979)."""
-        n = len(obs) * WORLD_SIZE
-        mean = average(obs.mean(0))
-        var = average(((obs - mean) ** 2).mean(0))
+        """Merge mean and variance of the states in a batch of observations into the running ones (Chan et al. 1979)."""
+        if self.state_layer is None:
+            return
+        state, n = obs["state"], len(obs["state"]) * WORLD_SIZE
+        mean = all_reduce_mean(state.mean(0))
+        var = all_reduce_mean(((state - mean) ** 2).mean(0))
         count, delta = self.obs_count + n, mean - self.obs_mean
         m2 = self.obs_var * self.obs_count + var * n
         self.obs_var.copy_((m2 + delta**2 * self.obs_count * n / count) / count)
@@ -459,18 +600,7 @@ class Agent(nn.Module):
         return action, policy.log_prob(action).sum(-1), policy.entropy().sum(-1), value
 
 
-def random_shift(obs: dict, pad: int) -> dict:
-    """Shift the images of each observation by up to `pad` pixels in both directions, and repeat their borders: the
-    augmentation of DrQ (Kostrikov et al. 2020, arXiv 2004.13649). The state stays."""
-    batch, height, width = next(v for k, v in obs.items() if k != "state").shape[:3]
-    device = next(iter(obs.values())).device
-    shift = torch.randint(-pad, pad + 1, (2, batch, 1), device=device)
-    rows = (torch.arange(height, device=device) + shift[0]).clamp(0, height - 1)[:, :, None]
-    columns = (torch.arange(width, device=device) + shift[1]).clamp(0, width - 1)[:, None, :]
-    each = torch.arange(batch, device=device)[:, None, None]
-    return {k: v if k == "state" else v[each, rows, columns] for k, v in obs.items()}
-
-
+# ----- PPO ------------------------------------------------------------------------------------------------------------
 def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_horizon=False):
     """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
 
@@ -502,14 +632,51 @@ def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_h
     return advantages, advantages + values
 
 
-def bootstraps(rule: str, terminated: torch.Tensor, truncated: torch.Tensor) -> torch.Tensor:
-    """Whether the value of an episode's final observation counts: bool (num_envs,).
+def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.optim.Optimizer:
+    """Adam with one group each for the policy's mean, its standard deviation and the critic."""
+    special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
+    actor = [p for p in agent.parameters() if id(p) not in special]
+    critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
+    adapts = args.desired_kl is not None
+    groups = [
+        dict(params=actor, initial_lr=args.learning_rate, adapts=adapts),
+        dict(params=[agent.actor_logstd], initial_lr=args.learning_rate * args.logstd_lr_factor, adapts=adapts),
+        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, adapts=False),
+    ]
+    for group in groups:
+        group["lr"] = torch.tensor(group["initial_lr"], device=device)  # where a CUDA graph reads it
+    return torch.optim.Adam(groups, eps=1e-5, fused=True, capturable=device.type == "cuda")
 
-    ManiSkill's rewards are positive at every step: without that value ("never"), an early success would earn less than
-    dawdling. "truncated" is the textbook rule (Pardo et al. 2018, arXiv 1712.00378)."""
-    if rule == "truncated":
-        return truncated & ~terminated
-    return torch.full_like(truncated, rule == "always")
+
+def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
+    """Load Adam's moments, and each learning rate as far as it was adapted, unless its flag has changed."""
+    flags = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
+    optimizer.load_state_dict(saved)
+    for group, flag in zip(optimizer.param_groups, flags):
+        if group["adapts"] and flag["adapts"] and group["initial_lr"] == flag["initial_lr"]:
+            flag["lr"].copy_(group["lr"])
+        group.update(flag)
+
+
+def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
+    """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
+    less than half of it (Rudin et al. 2022, arXiv 2109.11978), between a hundredth and ten times of the initial one."""
+    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
+    for group in optimizer.param_groups:
+        if group["adapts"]:
+            group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
+
+
+def random_shift(obs: dict, pad: int) -> dict:
+    """Shift the images of each observation by up to `pad` pixels in both directions, and repeat their borders: the
+    augmentation of DrQ (Kostrikov et al. 2020, arXiv 2004.13649). The state stays."""
+    batch, height, width = next(v for k, v in obs.items() if k != "state").shape[:3]
+    device = next(iter(obs.values())).device
+    shift = torch.randint(-pad, pad + 1, (2, batch, 1), device=device)
+    rows = (torch.arange(height, device=device) + shift[0]).clamp(0, height - 1)[:, :, None]
+    columns = (torch.arange(width, device=device) + shift[1]).clamp(0, width - 1)[:, None, :]
+    each = torch.arange(batch, device=device)[:, None, None]
+    return {k: v if k == "state" else v[each, rows, columns] for k, v in obs.items()}
 
 
 UPDATE_METRICS = ("policy_loss", "value_loss", "entropy", "approx_kl", "clipfrac", "grad_norm")
@@ -520,12 +687,14 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     With several processes it is the step of all their rows together.
 
     Returns the UPDATE_METRICS of the minibatch, one tensor on the device."""
+    if args.random_shift:
+        obs = random_shift(obs, args.random_shift)
     _, newlogprob, entropy, newvalue = agent.get_action_and_value(obs, actions)
     logratio = newlogprob - logprobs
     ratio = logratio.exp()
     if args.norm_adv:
-        advantages = advantages - average(advantages.mean())
-        advantages = advantages / (average((advantages**2).mean()).sqrt() + 1e-8)
+        advantages = advantages - all_reduce_mean(advantages.mean())
+        advantages = advantages / (all_reduce_mean((advantages**2).mean()).sqrt() + 1e-8)
 
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
@@ -546,7 +715,7 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     with torch.no_grad():
         approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
         if args.desired_kl is not None:
-            adapt_learning_rate(optimizer, average(approx_kl), args.desired_kl)
+            adapt_learning_rate(optimizer, all_reduce_mean(approx_kl), args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -556,8 +725,7 @@ def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
     """Act for num_steps in the environments of one actor, and write what happens into its columns of the storage.
 
     Args:
-        storage: each texture, the state, actions, logprobs, rewards, dones, values and next_values, (num_steps,
-            num_envs, ...) each.
+        storage: obs (a dict), actions, logprobs, rewards, dones, values, next_values, each (num_steps, num_envs, ...).
         obs: the first observation, as ImageObservations makes it.
         act: agent.get_action_and_value, or a CUDA graph of it.
 
@@ -567,71 +735,45 @@ def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
     for step in range(args.num_steps):
         action, logprob, _, value = act(obs)
         for name, x in obs.items():
-            storage[name][step] = x
+            storage["obs"][name][step] = x
         storage["actions"][step], storage["logprobs"][step], storage["values"][step] = action, logprob, value
         obs, reward, terminated, truncated, infos = envs.step(agent.clip_action(action))
         done = terminated | truncated
         storage["rewards"][step] = reward * args.reward_scale
         storage["dones"][step] = done
         if "final_observation" in infos:  # some episodes ended: there, obs is the first one of the next episode
-            counts = bootstraps(args.bootstrap_at_done, terminated, truncated)
-            final_values[step] = torch.where(counts, agent.get_value(infos["final_observation"]), 0.0)
+            # ManiSkill's rewards are positive at every step: without the final value, an early success would earn less
+            # than dawdling. "truncated" is the textbook rule (Pardo et al. 2018, arXiv 1712.00378).
+            counts = {"always": done, "truncated": truncated & ~terminated, "never": torch.zeros_like(done)}
+            final_value = agent.get_value(infos["final_observation"])
+            final_values[step] = torch.where(counts[args.bootstrap_at_done], final_value, 0.0)
             add_episodes(sums, infos["final_info"], done)
     following_values = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
     storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following_values))
     return obs, sums
 
 
-def train(args: Args, closing: contextlib.ExitStack) -> int:
-    """A run from its first evaluation to its last checkpoint; returns the exit code.
-
-    However the run ends, `closing` then writes last.pt, closes the files and ends the actors."""
-    # --- environments, agent, optimizer ---
-    stop_signals = closing.enter_context(StopSignals())
-    device, run_dir = start_processes(args, closing)
-    args = gather(args)[0]  # all processes need the same; defaults depend on the machine
-    local = local_args(args)  # this process's part of the environments
+def train(args: Args, closing: contextlib.ExitStack) -> None:
+    """A run from its first evaluation to its last checkpoint. However it ends, `closing` then writes last.pt, closes
+    the files and ends the actors."""
+    # --- environments, agent, optimizer; `args` counts what all processes of torchrun have, `local` what this one has
+    args, local, device, run_dir = start_processes(args, closing)
     path = args.resume or args.checkpoint
     loaded = load_checkpoint(path) if path else {}
     resumed = loaded if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     torch.set_num_threads(1)  # idle threads would spin on cores that the simulation needs
 
-    seed_all(args.seed)  # some tasks draw random numbers while they are built
-    actors = closing.enter_context(contextlib.closing(Actors(local, run_dir / "videos")))
-    envs = actors.local.envs
-    num_eval_episodes, max_eval_steps = evaluation_size(actors.local.eval_envs, local)
-    # PhysX remembers contacts of earlier episodes, and a batch keeps the objects that it was built with
-    rebuilds = args.sim_backend == "physx_cpu" and (args.exact_resume or varies_objects(args.env_id))
-
-    seed_all(args.seed)  # the same weights, whatever the environments drew
-    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(device)
-    if loaded:
-        load_weights(agent, loaded, path)
-    if WORLD_SIZE > 1:  # machines may turn the same seed into different weights
-        agent.load_state_dict(gather({k: v.cpu() for k, v in agent.state_dict().items()})[0])
+    actors = Actors(local, run_dir / "videos", closing)
+    agent = make_agent(*actors.spaces, args, loaded).to(device)
     optimizer = make_optimizer(agent, args, device)
     if loaded:  # the initial learning rate would wreck a policy whose standard deviation has shrunk
         load_optimizer(optimizer, loaded["optimizer"])
 
-    # --- storage: where the environments are; a learner on another device copies it, and its actors copy the agent
-    shape = (args.num_steps, local.num_envs)
-    names = ("logprobs", "rewards", "dones", "values", "next_values")
-    storage = {name: torch.zeros(shape, device=envs.device) for name in names}
-    for name, space in envs.single_observation_space.items():  # images in the dtype in which they are rendered
-        storage[name] = torch.zeros(*shape, *space.shape, dtype=getattr(torch, space.dtype.name), device=envs.device)
-    storage["actions"] = torch.zeros(*shape, *envs.single_action_space.shape, device=envs.device)
-    acting_agent, learner_storage = agent, storage
-    if envs.device.type != device.type:
-        acting_agent = copy.deepcopy(agent).to(envs.device)
-        learner_storage = {name: x.to(device) for name, x in storage.items()}
-    actors.connect(acting_agent, storage)
-    if args.compile:  # only now: a compiled function cannot be sent to other actors
-        for network in {agent, acting_agent}:  # on one device they are the same
-            network.get_action_and_value = torch.compile(network.get_action_and_value, dynamic=False)
-    actors.local.act = CudaGraph(acting_agent.get_action_and_value, args, envs.device)
-    obs_names = [*envs.single_observation_space]
-    batch = {name: learner_storage[name].flatten(0, 1) for name in (*obs_names, "actions", "logprobs", "values")}
+    # --- buffers: `storage` has tensors (num_steps, num_envs, ...), `batch` views of them (num_steps * num_envs, ...)
+    storage = actors.share_memory(agent, device)
+    names = ("obs", "actions", "logprobs", "values")
+    batch = tree_map(lambda x: x.flatten(0, 1), {name: storage[name] for name in names})
     batch |= {name: torch.zeros(local.batch_size, device=device) for name in ("advantages", "returns")}
     permutation = torch.zeros(local.batch_size, dtype=torch.long, device=device)
 
@@ -639,117 +781,87 @@ def train(args: Args, closing: contextlib.ExitStack) -> int:
         """All minibatches of a permutation of the batch; returns their UPDATE_METRICS, a row each."""
         rows = []
         for mb_inds in permutation.split(local.minibatch_size)[: args.num_minibatches]:
-            mb = {name: x[mb_inds] for name, x in batch.items()}
-            mb["obs"] = {name: mb.pop(name) for name in obs_names}
-            if args.random_shift:
-                mb["obs"] = random_shift(mb["obs"], args.random_shift)
+            mb = tree_map(lambda x: x[mb_inds], batch)
             rows.append(update_minibatch(agent, optimizer, args, **mb))
-        return average(torch.stack(rows))
+        return all_reduce_mean(torch.stack(rows))
 
-    run_update_epoch = closing.enter_context(contextlib.closing(CudaGraph(update_epoch, args, device)))
+    run_update_epoch = CudaGraph(update_epoch, args, device)
+    closing.callback(run_update_epoch.close)
 
-    logger = closing.enter_context(contextlib.closing(Logger(args, run_dir, device, resumed)))
-    checkpoints = closing.enter_context(contextlib.closing(Checkpoints(local, run_dir, resumed)))
-    film = closing.enter_context(contextlib.closing(Film(local, run_dir)))
-    spaces = {name: [list(space.shape), space.dtype.name] for name, space in envs.single_observation_space.items()}
-    about = dict(args=asdict(args), obs_spaces=spaces, world_size=WORLD_SIZE, wandb_id=logger.wandb_id)
-    num_skipped = 0
+    logger = Logger(args, run_dir, device, resumed)
+    closing.callback(logger.close)
+    checkpoints = Checkpoints(local, run_dir, resumed, agent, optimizer, actors.spaces[0], logger)
+    closing.callback(checkpoints.close)
+    film = Film(local, run_dir, closing)
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
-        stopped_by = max(gather(stop_signals.received))  # all processes stop at the same iteration
-        finished = iteration == args.num_iterations and not stopped_by
-
-        # --- checkpoint: a resumed run goes on from here ---
-        weights = copy.deepcopy(dict(agent=agent.state_dict(), optimizer=optimizer.state_dict()))
-        progress = dict(iteration=iteration, global_step=global_step, finished=finished)
-        checkpoints.update(weights | progress | about | dict(metrics_size=logger.file.tell()))
+        # --- checkpoint: a run that ends in this iteration, for whatever reason, goes on from here ---
+        checkpoints.take(iteration, global_step)
 
         # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
-        if acting_agent is not agent:
-            acting_agent.load_state_dict(agent.state_dict())
-        is_due = args.eval_freq and iteration % args.eval_freq == 0
-        if finished or (iteration == 0 or is_due) and not stopped_by:
-            seed = args.eval_seed + RANK * num_eval_episodes
-            episodes = join(actors.call("evaluate", num_eval_episodes, seed, max_eval_steps))
-            episodes = join(gather(episodes))
+        is_last = iteration == args.num_iterations
+        if is_last or iteration == 0 or args.eval_freq and iteration % args.eval_freq == 0:
+            episodes = actors.evaluate(args.eval_seed)
             metrics = {key: values.mean().item() for key, values in episodes.items()}
             logger.log("eval", global_step, metrics | {"num_episodes": len(episodes["return"])})
-            checkpoints.update_best([metrics[key] for key in ("success_once", "return") if key in metrics])
+            checkpoints.update_best([metrics[key] for key in BEST_BY if key in metrics])
             if local.capture_video:
-                film.record(acting_agent, f"videos/step_{global_step:09d}", args.eval_seed, max_eval_steps)
-            if args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success:
-                finished = True
-        if finished or stopped_by:
-            break
+                film.record(actors.agent, f"videos/step_{global_step:09d}", args.eval_seed)
+            is_solved = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
+            if is_last or is_solved:
+                checkpoints.contents["finished"] = is_last
+                break
 
         # --- rollout: num_steps in every environment, in all actors at the same time ---
         start = time.perf_counter()
-        restarts = iteration == first_iteration
-        if (args.exact_resume or rebuilds) and iteration % args.checkpoint_freq == 0:
-            restarts = True
-        results = actors.call("rollout", iteration, restarts, restarts and rebuilds)
-        if learner_storage is not storage:
-            for name, x in storage.items():
-                learner_storage[name].copy_(x)
+        sums_of_actors = actors.rollout(iteration, is_first=iteration == first_iteration)
         rollout_time = time.perf_counter() - start
 
         # --- advantages ---
-        gae_inputs = [learner_storage[name] for name in ("rewards", "values", "next_values", "dones")]
+        gae_inputs = [storage[name] for name in ("rewards", "values", "next_values", "dones")]
         advantages, returns = compute_gae(*gae_inputs, args.gamma, args.gae_lambda, args.finite_horizon_gae)
         batch["advantages"].copy_(advantages.flatten())
         batch["returns"].copy_(returns.flatten())
-        explained_variance = average(1 - advantages.var() / returns.var().clamp(min=1e-8))
+        explained_variance = all_reduce_mean(1 - advantages.var() / returns.var().clamp(min=1e-8))
 
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
-        torch.set_num_threads(num_update_threads())
+        torch.set_num_threads(max(1, int(num_cores() * UPDATE_THREADS_PER_CORE)))
         if args.anneal_lr:
             for group in optimizer.param_groups:
                 if not group["adapts"]:  # fill a tensor: Python numbers are frozen in a CUDA graph
                     group["lr"].fill_(group["initial_lr"] * (1 - iteration / args.num_iterations))
-        problems = sum(gather([problem for _, problem in results if problem]), [])  # of all processes
         update_metrics = []
-        for _ in range(0 if problems else args.update_epochs):  # learn from finite numbers only
+        for _ in range(args.update_epochs):
             torch.randperm(local.batch_size, out=permutation)
             update_metrics.append(run_update_epoch().clone())
             last_kl = update_metrics[-1][-1, UPDATE_METRICS.index("approx_kl")]
             if args.target_kl is not None and last_kl > args.target_kl:  # the host waits, once an epoch
                 break
-        has_state = "state" in batch
-        if args.norm_obs and has_state and not problems:  # only now: the update needs the rollout's log-probabilities
-            agent.update_normalization(batch["state"])
+        if args.norm_obs:  # only now: the update needs the rollout's log-probabilities
+            agent.update_normalization(batch["obs"])
         torch.set_num_threads(1)
         global_step += args.batch_size
 
         # --- log: here the host waits for the device ---
-        metrics = average_episodes([sums for sums, _ in results])
-        if update_metrics:
-            metrics |= dict(zip(UPDATE_METRICS, torch.cat(update_metrics).mean(0).tolist()))
-            if not torch.stack([x.isfinite().all() for x in (*agent.parameters(), agent.obs_var)]).all():
-                raise RunError("the update gave weights that are not finite: try a lower --learning_rate")
+        if not torch.stack([x.isfinite().all() for x in (*agent.parameters(), agent.obs_var)]).all():
+            raise RunError("the update gave weights that are not finite: try a lower --learning_rate")
+        metrics = average_episodes(sums_of_actors)
+        metrics |= dict(zip(UPDATE_METRICS, torch.cat(update_metrics).mean(0).tolist()))
         elapsed = time.perf_counter() - start
         metrics |= dict(
-            iteration=iteration + 1, explained_variance=explained_variance.item(), update_skipped=int(bool(problems)),
+            iteration=iteration + 1, explained_variance=explained_variance.item(),
             learning_rate=optimizer.param_groups[0]["lr"].item(), sps=args.batch_size / elapsed,
-            rollout_time=rollout_time, update_time=elapsed - rollout_time, **logger.memory(),
+            rollout_time=rollout_time, update_time=elapsed - rollout_time,
         )  # fmt: skip
         logger.log("train", global_step, metrics)
-        num_skipped = num_skipped + 1 if problems else 0
-        if problems:
-            logger.print(f"iteration {iteration + 1}: no update: {problems[0]}")
-        if num_skipped == 5:
-            raise RunError(f"no update in 5 iterations in a row: {problems[0]}")
         if local.save_train_video_freq and iteration % local.save_train_video_freq == 0:
-            film.record(acting_agent, f"train_videos/step_{global_step:09d}", args.eval_seed, max_eval_steps, True)
-
-    return 0 if finished else 128 + stopped_by
+            film.record(actors.agent, f"train_videos/step_{global_step:09d}", args.eval_seed, exploring=True)
 
 
 # ----- Machinery: nothing below is PPO --------------------------------------------------------------------------------
 
 
 # ----- Evaluation -----------------------------------------------------------------------------------------------------
-
-
 @torch.no_grad()
 def evaluate(
     agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild_freq: int = 0, separately: bool = False,
@@ -785,6 +897,8 @@ def evaluate(
             running &= ~ended
             for k, v in episode_metrics(infos).items():
                 episodes[k] = torch.where(ended, v.float(), episodes.get(k, 0.0))
+            if not running.any():
+                break
         if isinstance(envs._env, RecordEpisode):
             envs._env.flush_trajectory()
         rounds.append(episodes)
@@ -827,84 +941,91 @@ def start_episodes(envs: ManiSkillVectorEnv, seeds: list[int], separately: bool)
     return obs
 
 
-def join(parts: list[dict]) -> dict[str, torch.Tensor]:
+def concatenate(parts: list[dict]) -> dict[str, torch.Tensor]:
     """The episodes of several actors or processes, in order."""
     parts = [part for part in parts if part]
     return {k: torch.cat([part[k] for part in parts]) for k in parts[0]}
 
 
-def interval(values: torch.Tensor, is_rate: bool) -> tuple[float, float]:
-    """95% confidence interval of the mean of `values`: Wilson's score interval for a rate, else the normal one."""
+def interval(values: torch.Tensor) -> tuple[float, float]:
+    """95% confidence interval of the mean of `values`: Wilson's score interval of a rate, if all are 0 or 1, else the
+    normal one."""
     n, mean, z = len(values), values.double().mean().item(), 1.96
-    if is_rate:
+    if ((values == 0) | (values == 1)).all():
         centre = (mean + z**2 / (2 * n)) / (1 + z**2 / n)
         half = z / (1 + z**2 / n) * math.sqrt(mean * (1 - mean) / n + z**2 / (4 * n**2))
         return max(0.0, centre - half), min(1.0, centre + half)
-    half = z * values.double().std().item() / math.sqrt(n)
+    half = z * values.double().std().item() / math.sqrt(n) if n > 1 else math.inf
     return mean - half, mean + half
 
 
-def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> int:
+def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> None:
     """--evaluate: play the episodes, print, film and write the results."""
     torch.set_num_threads(1)
-    _, folder = start_processes(args, closing)
-    actors = closing.enter_context(contextlib.closing(Actors(args, folder / "test_videos")))
-    envs = actors.local.eval_envs
-    agent = Agent(envs.single_observation_space, envs.single_action_space, args).to(envs.device)
-    load_weights(agent, load_checkpoint(args.checkpoint), args.checkpoint)
-    actors.connect(agent)
-    num_episodes, num_steps = evaluation_size(envs, args)
-    episodes = join(actors.call("evaluate", num_episodes, args.eval_seed, num_steps))
-    film = closing.enter_context(contextlib.closing(Film(args, folder)))
+    _, _, _, folder = start_processes(args, closing)
+    actors = Actors(args, folder / "test_videos", closing)
+    agent = make_agent(*actors.spaces, args, load_checkpoint(args.checkpoint)).to(actors.device)
+    actors.share_memory(agent, actors.device)
+    episodes = actors.evaluate(args.eval_seed)
+    film = Film(args, folder, closing)
     if args.capture_video:
         for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs):
-            film.record(agent, f"test_videos/seed_{seed}", seed, num_steps)
+            film.record(agent, f"test_videos/seed_{seed}", seed)
 
-    results = dict(env_id=args.env_id, num_episodes=num_episodes, eval_seed=args.eval_seed)
-    print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {args.eval_seed} on, 95% intervals:")
+    results = dict(env_id=args.env_id, num_episodes=len(episodes["return"]), eval_seed=args.eval_seed)
+    print(f"{args.env_id} on {args.sim_backend}, {results['num_episodes']} episodes from seed {args.eval_seed} on, "
+          "95% intervals:")  # fmt: skip
     for key, values in episodes.items():
         results[key] = values.mean().item()
         line = f"  {key:<20}{results[key]:8.3f}"
-        is_rate = key.startswith(("success", "fail"))
-        if len(values) > 1 or is_rate:
-            low, high = results[f"{key}_interval"] = interval(values, is_rate)
+        low, high = interval(values)
+        if math.isfinite(low):  # a single episode has none
+            results[f"{key}_interval"] = low, high
             line += f"  [{low:.3f}, {high:.3f}]"
         print(line)
     (folder / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
-    print(f"written: {folder / 'eval.json'}" + (f", {folder / 'test_videos'}" if args.capture_video else ""))
-    return 0
+    print(f"written: {folder / 'eval.json'}" + (f", {folder / 'test_videos'}" if film.envs else ""))
+
+
+def find_render_error(args: Args) -> Optional[str]:
+    """Why nothing can render what is simulated, or None: GPU simulation needs a GPU for it, too."""
+    if RENDER_DEVICE is not None and (args.sim_backend == "physx_cpu" or RENDER_DEVICE.is_cuda()):
+        return None
+    return ("there is no Vulkan device to render images (CPU: apt install mesa-vulkan-drivers, 23.1 or newer; "
+            "GPU: NVIDIA_DRIVER_CAPABILITIES=all in a container)")  # fmt: skip
 
 
 class Film:
     """A small batch of its own that plays the first evaluation episodes again, into videos."""
 
-    def __init__(self, args: Args, folder: Path):
-        self.args, self.folder, self.envs = args, folder, None
+    def __init__(self, args: Args, folder: Path, closing: contextlib.ExitStack):
+        self.args, self.folder, self.closing, self.envs = args, folder, closing, None
+        self.is_off = args.render_backend == "none"
         self.num_envs = 1 if args.sim_backend == "physx_cpu" else 4
 
-    def record(self, agent, name: str, seed: int, num_steps: int, exploring: bool = False) -> None:
-        """Write <folder>/<name>.mp4, frame by frame. A film that cannot be written does not end the run."""
-        if self.envs is None:
-            self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
+    def record(self, agent, name: str, seed: int, exploring: bool = False) -> None:
+        """Write <folder>/<name>.mp4, frame by frame. If that fails, the run goes on without videos."""
+        if self.is_off:
+            return
         path, rebuild_freq = self.folder / f"{name}.mp4", evaluation_rebuild_freq(self.args)
         try:
+            if find_render_error(self.args):
+                raise RunError(find_render_error(self.args))
+            if self.envs is None:
+                self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
+                self.closing.callback(self.envs.close)
+            num_steps = evaluation_size(self.envs, self.args)[1]
             path.parent.mkdir(parents=True, exist_ok=True)
             with imageio.get_writer(path, fps=self.envs.base_env.control_freq) as video:
-                evaluate(
-                    agent, self.envs, self.num_envs, seed, num_steps, rebuild_freq, exploring=exploring, video=video
-                )
-        except OSError as error:
-            print(f"no video {path}: {error}", flush=True)
+                options = dict(rebuild_freq=rebuild_freq, exploring=exploring, video=video)
+                evaluate(agent, self.envs, self.num_envs, seed, num_steps, **options)
+        except Exception as error:
+            self.is_off = True
+            tqdm.write(f"no videos: {describe(error)}")
             path.unlink(missing_ok=True)
-
-    def close(self) -> None:
-        if self.envs is not None:
-            self.envs.close()
 
 
 # ----- Environments ---------------------------------------------------------------------------------------------------
-
-
 def find_task(env_id: str):
     """The registration of a task. Raises KeyError or ImportError if there is none."""
     module, _, name = env_id.rpartition(":")
@@ -918,111 +1039,21 @@ def varies_objects(env_id: str) -> bool:
     return "reconfiguration_freq" in inspect.signature(find_task(env_id).cls.__init__).parameters
 
 
-class ImageObservations(FlattenRGBDObservationWrapper):
-    """Observations as a dict: "state", if included, float32 (num_envs, state_dim), and each texture of `obs_mode`:
-    (num_envs, height, width, channels of all cameras and frames), in the dtype in which it is rendered (uint8 colours,
-    int16 millimetres and ids, float32 normals). ManiSkill's wrapper supports colours and depth. This one adds the other
-    textures, frame stacking that survives partial resets, and videos of what the policy sees."""
-
-    def __init__(self, env: gym.Env, args: Args):
-        textures = args.obs_mode.split("+")
-        self.others = [k for k in textures if k not in ("rgb", "depth")]
-        self.num_frames, self.frames, self.latest = args.frame_stack, {}, {}
-        cameras = env.unwrapped._init_raw_obs["sensor_data"].values()
-        if not cameras:
-            raise RunError("neither the task nor its robot has a camera; ppo.py learns from the state")
-        if len({x.shape[1:3] for camera in cameras for x in camera.values()}) > 1:
-            raise RunError("the sizes of the cameras differ: give --camera_width and --camera_height")
-        super().__init__(env, rgb="rgb" in textures, depth="depth" in textures, state=args.include_state)
-
-    def observation(self, observation: dict, new_episodes=None) -> dict:
-        cameras = observation["sensor_data"].values()
-        latest = super().observation(observation)
-        latest |= {k: torch.cat([camera[k] for camera in cameras], dim=-1) for k in self.others}
-        if "segmentation" in latest:
-            latest["segmentation"] = latest["segmentation"].short()  # some shaders give 64 bits
-        # A GPU may render CPU simulation. With GPU simulation, the observation that defines the space is on the CPU.
-        latest = self.latest = {k: v.to(self.base_env.device) for k, v in latest.items()}
-        if self.num_frames == 1:
-            return dict(latest)
-        for k, frame in latest.items():
-            filled = torch.cat([frame] * self.num_frames, dim=-1)  # an episode starts with its first frame repeated
-            if new_episodes is not None and k in self.frames:
-                self.frames[k] = self.frames[k].index_copy(0, new_episodes, filled[new_episodes])
-            elif k in self.frames:
-                self.frames[k] = torch.cat([self.frames[k][..., frame.shape[-1] :], frame], dim=-1)
-            else:
-                self.frames[k] = filled
-        return dict(self.frames)
-
-    def reset(self, *, seed=None, options=None):
-        obs, info = self.env.reset(seed=seed, options=options)
-        env_idx = (options or {}).get("env_idx", np.arange(self.base_env.num_envs))
-        return self.observation(obs, torch.as_tensor(env_idx, device=self.base_env.device)), info
-
-    def render(self) -> torch.Tensor:
-        """The scene, what the policy sees, or both, as render_mode asks: uint8 (num_envs, height, width, 3)."""
-        mode = self.base_env.render_mode
-        scene = None if mode == "sensors" else self.base_env.render_rgb_array()
-        if mode == "rgb_array":
-            return scene
-        views = []
-        for k, texture in self.latest.items():
-            for x in () if k == "state" else texture.split(TEXTURES[k], dim=-1):  # of each camera
-                if k == "depth":
-                    x = 255 * (x > 0) / (1 + x / 1000)
-                elif k == "segmentation":
-                    x = x.int() * torch.tensor([37, 91, 151], device=x.device) % 256
-                elif k == "position":
-                    x = 128 + x / 1000 * 64
-                elif k == "normal":
-                    x = (x + 1) * 127.5
-                views.append(x.clamp(0, 255).to(torch.uint8).expand(*x.shape[:-1], 3).permute(0, 3, 1, 2))
-        height = views[0].shape[2] if scene is None else scene.shape[1] // max(2, len(views))
-        views = [F.interpolate(v, size=(height, height * v.shape[3] // v.shape[2])) for v in views]
-        image = torch.cat(views, dim=2).permute(0, 2, 3, 1)
-        if scene is not None:
-            column = F.pad(image, (0, 0, 0, 0, 0, scene.shape[1] - image.shape[1]))
-            image = torch.cat([scene.to(column.device), column], dim=2)
-        # video codecs want multiples of 16
-        return F.pad(image, (0, 0, 0, -image.shape[2] % 16, 0, -image.shape[1] % 16))
-
-
-def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
-    """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
-    modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
-    render_backend = args.render_backend
-    if render_backend == "gpu" and args.sim_backend != "physx_cpu":
-        render_backend = args.sim_backend.replace("physx_cuda", "gpu")  # the GPU that simulates
-    kwargs = dict(
-        num_envs=num_envs,
-        obs_mode=args.obs_mode,
-        control_mode=args.control_mode,
-        robot_uids=tuple(args.robot_uids.split(",")) if "," in (args.robot_uids or "") else args.robot_uids,
-        reward_mode=args.reward_mode or next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in modes),
-        reconfiguration_freq=0 if evaluation else args.reconfiguration_freq,  # `evaluate` rebuilds its scenes itself
-        sim_backend=args.sim_backend,
-        render_backend=render_backend,
-        render_mode=args.render_mode if film else None,
-    )
-    kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
-    cameras = dict(width=args.camera_width, height=args.camera_height, shader_pack=args.shader)
-    cameras = {k: v for k, v in cameras.items() if v is not None} | kwargs.get("sensor_configs", {})
-    env = ImageObservations(gym.make(args.env_id, **kwargs | dict(sensor_configs=cameras)), args)
-    if isinstance(env.action_space, gym.spaces.Dict):
-        env = FlattenActionSpaceWrapper(env)
-    return env
+def make_task(env_id: str, **kwargs) -> gym.Env:
+    """gym.make. What ManiSkill says of an argument becomes one line; an error in your own code keeps its traceback."""
+    try:
+        return gym.make(env_id, **kwargs)
+    except Exception as error:
+        if isinstance(error, RunError) or not is_from_packages(error):
+            raise
+        raise RunError(f"{env_id}: {describe(error)}") from None
 
 
 def make_envs(
     args: Args, num_envs: int, seed: int, evaluation: bool = False, film: bool = False, record: Optional[dict] = None
 ) -> ManiSkillVectorEnv:
-    """Environments with ManiSkill's interface for a batch. Evaluation's do not reset by themselves.
-
-    Args:
-        seed: the objects of the scenes follow from it, in tasks that vary them.
-        film: render the environments.
-        record: arguments of RecordEpisode, which writes trajectories."""
+    """Environments with ManiSkill's interface for a batch. Evaluation's do not reset by themselves. In tasks that vary
+    their objects, these follow from the seed. `record`: arguments of RecordEpisode, which writes trajectories."""
     sapien_env.BaseEnv.build_seed = seed
     env = make_env(args, num_envs, evaluation, film)
     if record:
@@ -1048,38 +1079,40 @@ def evaluation_rebuild_freq(args: Args) -> int:
     """After how many rounds of episodes an evaluation builds new scenes (0: never)."""
     if args.eval_reconfiguration_freq is not None:
         return args.eval_reconfiguration_freq
-    is_exact = args.exact_resume and args.sim_backend == "physx_cpu"
-    return 1 if varies_objects(args.env_id) or is_exact else 0
+    return 1 if varies_objects(args.env_id) or args.exact_resume else 0
 
 
-def can_reset_some(envs: ManiSkillVectorEnv) -> bool:
-    """Whether the task can reset some of several environments. A few of ManiSkill's tasks fail."""
-    try:
-        envs.reset(options=dict(env_idx=torch.zeros(1, dtype=torch.long, device=envs.device)))
-    except (RuntimeError, IndexError, ValueError, AssertionError):
-        return envs.num_envs == 1
-    return True
+def training_rebuild_freq(args: Args, envs: ManiSkillVectorEnv) -> float:
+    """After how many iterations training builds new scenes (infinity: never)."""
+    limit = find_max_episode_steps_value(envs)
+    if args.exact_resume:  # PhysX remembers contacts of earlier episodes
+        return args.checkpoint_freq
+    if args.sim_backend == "physx_cpu" and varies_objects(args.env_id) and limit and not args.reconfiguration_freq:
+        return math.ceil(10 * limit / args.num_steps)  # other objects after ten episodes of full length
+    return math.inf
 
 
-def check_task(args: Args, envs: ManiSkillVectorEnv, resets_some: bool) -> None:
+def find_reset_error(envs: ManiSkillVectorEnv) -> Optional[Exception]:
+    """What the task raises if some of several environments are reset, as a few of ManiSkill's tasks do, or None."""
+    if envs.num_envs > 1:
+        try:
+            envs.reset(options=dict(env_idx=torch.zeros(1, dtype=torch.long, device=envs.device)))
+        except (RuntimeError, IndexError, ValueError, AssertionError) as error:
+            return error
+    return None
+
+
+def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     """Refuse partial resets that the task cannot do; print a note if gamma does not suit the length of its episodes."""
-    ends_early = args.partial_reset and {"success", "fail"} & envs.reset()[1].keys()
-    if ends_early and not resets_some:
-        fail(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives each its "
-             "own process; --no-partial_reset resets all together")  # fmt: skip
+    reset_error = find_reset_error(envs)
+    if args.partial_reset and reset_error and {"success", "fail"} & envs.reset()[1].keys():
+        raise RunError(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives "
+                       "each its own process; --no-partial_reset resets all together; the task raised "
+                       f"{describe(reset_error)}")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
     if limit and args.gamma < 1 and not limit / 25 <= 1 / (1 - args.gamma) <= 10 * limit:
         print(f"note: --gamma {args.gamma} looks {1 / (1 - args.gamma):.0f} steps ahead, and an episode has {limit}: "
               f"try about {1 - 10 / max(limit, 20):.3g}")  # fmt: skip
-    space, device = envs.single_observation_space, choose_device(args)
-    size = sum(x.dtype.itemsize * math.prod(x.shape) for x in space.values())
-    needed = size * args.num_steps * args.num_envs
-    free = psutil.virtual_memory().available / LOCAL_WORLD_SIZE
-    if device.type == "cuda":  # it holds the images, or a copy
-        free = torch.cuda.mem_get_info(device)[0]
-    print(f"observations of a rollout: {needed / 2**20:,.1f} MiB of {free / 2**20:,.0f} MiB")
-    if needed > 0.9 * free:
-        fail(f"they do not fit: try --num_steps {args.num_steps // 2}, fewer --num_envs, or a smaller --camera_width")
 
 
 def refuse_download(message: str) -> NoReturn:
@@ -1117,8 +1150,6 @@ def seed_all(*numbers: int) -> None:
 
 
 # ----- Batched CPU simulation -----------------------------------------------------------------------------------------
-
-
 class Array:
     """Stands for SAPIEN's CUDA arrays, which ManiSkill reads and writes as .torch()."""
 
@@ -1163,7 +1194,7 @@ class BatchedPhysx:
         self.links = [link for system in self.systems for link in system.articulation_link_components]
         self.robots = [link.articulation for link in self.links if link.is_root]
         self.joints = [robot.active_joints for robot in self.robots]
-        self.driven, self.contacts, self.packed, self.pose_sizes = set(), None, None, None
+        self.driven, self.contacts, self.is_fetched, self.pose_sizes = set(), None, False, None
         self.row = {body: i for i, body in enumerate(self.free + self.links)}
         self.row |= {robot: i for i, robot in enumerate(self.robots)}
         self.root_rows = torch.tensor([self.row[link] for link in self.links if link.is_root], dtype=torch.long)
@@ -1194,10 +1225,7 @@ class BatchedPhysx:
         for i, robot in enumerate(self.robots):
             columns = roots_at[i] + 13 + torch.arange(2 * robot.dof)
             self.joint_columns[:, i, : robot.dof] = columns.view(2, robot.dof)
-        self.gpu_fetch_rigid_dynamic_data()
-        self.gpu_fetch_articulation_link_pose()
-        self.gpu_fetch_articulation_qpos()
-        self.gpu_fetch_articulation_qvel()
+        self._fetch()
 
     def step(self) -> None:
         self.gpu_apply_articulation_target_position()
@@ -1206,18 +1234,18 @@ class BatchedPhysx:
             self.robots[i].root.wake_up()  # as in a single environment, where setting a target wakes the robot
         for system in self.systems:
             system.step()
-        self.contacts = self.packed = None
+        self.contacts, self.is_fetched = None, False
 
     # --- from the simulation to the tensors ---
 
-    def _pack(self) -> None:
-        """Read the state of all scenes, unless nothing has changed since."""
-        if self.packed is not None:
+    def _fetch(self) -> None:
+        """Read the state of all scenes, unless nothing has changed since. Of the links, only roots get velocities: few
+        tasks ask for others, and `read_velocities` then reads them."""
+        if self.is_fetched:
             return
+        self.is_fetched = True
         states = [system.pack() for system in self.systems]
         poses = [scene.pack_poses() for scene in self.scenes]  # quaternion and position of each entity
-        self.packed = torch.frombuffer(bytearray().join([*states, bytes(4)]), dtype=torch.float32)
-        self.packed_poses = torch.frombuffer(bytearray().join([*poses, bytes(4)]), dtype=torch.float32)
         sizes = [len(x) // 4 for x in poses]
         if sizes != self.pose_sizes:  # lights and cameras, which are entities, may be added at any time
             self.pose_sizes, entity_at = sizes, {}
@@ -1225,34 +1253,23 @@ class BatchedPhysx:
                 entity_at |= {entity: int(start) + 7 * i for i, entity in enumerate(scene.entities)}
             links_at = torch.tensor([entity_at[link.entity] for link in self.links], dtype=torch.long)
             self.link_columns = links_at[:, None] + torch.tensor([4, 5, 6, 0, 1, 2, 3])
+        states = torch.frombuffer(bytearray().join([*states, bytes(4)]), dtype=torch.float32)
+        poses = torch.frombuffer(bytearray().join([*poses, bytes(4)]), dtype=torch.float32)
+        free, links = slice(0, len(self.free)), slice(len(self.free), None)
+        self.cuda_rigid_body_data.fetch(states[self.free_columns], free)
+        self.cuda_rigid_body_data.fetch(poses[self.link_columns], links, slice(0, 7))
+        self.cuda_rigid_body_data.fetch(states[self.root_columns], self.root_rows, slice(7, 13))
+        self.cuda_articulation_qpos.fetch(states[self.joint_columns[0]])
+        self.cuda_articulation_qvel.fetch(states[self.joint_columns[1]])
 
-    def gpu_fetch_rigid_dynamic_data(self) -> None:
-        self._pack()
-        self.cuda_rigid_body_data.fetch(self.packed[self.free_columns], slice(0, len(self.free)))
-
-    def gpu_fetch_articulation_link_pose(self) -> None:
-        self._pack()
-        links = slice(len(self.free), None)
-        self.cuda_rigid_body_data.fetch(self.packed_poses[self.link_columns], links, slice(0, 7))
-
-    def gpu_fetch_articulation_link_velocity(self) -> None:
-        """Fetches the roots' velocities. Few tasks ask for other links: `read_velocities` then reads theirs."""
-        self._pack()
-        self.cuda_rigid_body_data.fetch(self.packed[self.root_columns], self.root_rows, slice(7, 13))
+    gpu_fetch_rigid_dynamic_data = gpu_fetch_articulation_link_pose = gpu_fetch_articulation_link_velocity = _fetch
+    gpu_fetch_articulation_qpos = gpu_fetch_articulation_qvel = _fetch
 
     def read_velocities(self, links: list) -> None:
         for link in links:
             if not link.is_root:
                 velocity = torch.tensor([*link.linear_velocity, *link.angular_velocity])
                 self.cuda_rigid_body_data.data[self.row[link], 7:] = velocity
-
-    def gpu_fetch_articulation_qpos(self) -> None:
-        self._pack()
-        self.cuda_articulation_qpos.fetch(self.packed[self.joint_columns[0]])
-
-    def gpu_fetch_articulation_qvel(self) -> None:
-        self._pack()
-        self.cuda_articulation_qvel.fetch(self.packed[self.joint_columns[1]])
 
     def gpu_fetch_articulation_qacc(self) -> None:
         for robot, row in zip(self.robots, self.cuda_articulation_qacc.data):
@@ -1266,8 +1283,7 @@ class BatchedPhysx:
 
     def _changed_rows(self, array: Array, rows=slice(None), columns=slice(None)) -> list[int]:
         changed = array.find_changes(rows, columns)[:, 0].unique().tolist()
-        if changed:
-            self.packed = None
+        self.is_fetched &= not changed
         return changed
 
     def gpu_apply_rigid_dynamic_data(self) -> None:
@@ -1352,22 +1368,17 @@ class BatchedPhysx:
 
 
 class BatchedRenderer:
-    """Stands for SAPIEN's RenderSystemGroup: renders the cameras of all scenes one after the other."""
+    """Stands for SAPIEN's RenderSystemGroup and its camera groups: renders all scenes one after the other."""
 
-    def __init__(self, scenes: list[sapien.Scene]):
-        self.scenes = scenes
+    def __init__(self, scenes: list[sapien.Scene], cameras: tuple = ()):
+        self.scenes, self.cameras = scenes, cameras
 
     def update_render(self) -> None:
         for scene in self.scenes:
             scene.update_render()
 
-    def create_camera_group(self, cameras: list, names: list[str]) -> "BatchedCamera":
-        return BatchedCamera(cameras)
-
-
-class BatchedCamera:
-    def __init__(self, cameras: list):
-        self.cameras = cameras
+    def create_camera_group(self, cameras: list, names: list[str]) -> "BatchedRenderer":
+        return BatchedRenderer(self.scenes, cameras)
 
     def take_picture(self) -> None:
         for camera in self.cameras:
@@ -1470,28 +1481,27 @@ solve_inverse_kinematics_of_batches()
 
 
 # ----- Actors: processes that simulate on a CPU -----------------------------------------------------------------------
-
-
-def part(total: int, index: int, parts: int) -> range:
-    """Which of `total` things belong to one of several parts."""
-    return range(total * index // parts, total * (index + 1) // parts)
+def even_share(total: int, index: int, shares: int) -> range:
+    """Which of `total` things belong to one of several equal shares."""
+    return range(total * index // shares, total * (index + 1) // shares)
 
 
 class Actor:
-    """The environments of one process: its part of training, and its part of each evaluation."""
+    """The environments of one process: its share of training, and its share of each evaluation."""
 
     def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
         self.args, self.index = args, index
-        self.env_idx = part(args.num_envs, index, args.num_actors)
-        eval_episodes = part(args.num_eval_episodes, index, args.num_actors)
-        num_eval_envs = len(part(args.num_eval_envs, index, args.num_actors))
+        seed_all(args.seed, RANK, index)  # some tasks draw random numbers while they are built
+        self.env_idx = even_share(args.num_envs, index, args.num_actors)
+        eval_episodes = even_share(args.num_eval_episodes, index, args.num_actors)
+        num_eval_envs = len(even_share(args.num_eval_envs, index, args.num_actors))
         if args.num_eval_steps is None:
             num_eval_envs = min(num_eval_envs, len(eval_episodes))
         self.envs = None
         if not args.evaluate:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
             self.envs = make_envs(args, len(self.env_idx), seed)
-            self.resets_some = can_reset_some(self.envs)
+            self.rebuild_freq = training_rebuild_freq(args, self.envs)
         record = None
         if args.save_trajectory and trajectory_dir:
             record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}")
@@ -1499,39 +1509,47 @@ class Actor:
         self.eval_envs = make_envs(args, max(1, num_eval_envs), seed, evaluation=True, record=record)
         base_env = self.eval_envs.base_env
         batched = isinstance(base_env, sapien_env.BaseEnv) and is_batch(base_env.scene)
-        self.separately = batched and can_reset_some(self.eval_envs)
+        self.separately = batched and find_reset_error(self.eval_envs) is None
 
-    def connect(self, agent, storage: Optional[dict] = None) -> None:
-        """Receive the agent, and the storage to write into: this actor's columns."""
+    def receive(self, agent, storage: dict) -> None:
+        """Take the agent, and the storage to write into: this actor's columns."""
         columns = slice(self.env_idx.start, self.env_idx.stop)
         self.agent, self.act = agent, agent.get_action_and_value
-        self.storage = storage and {name: x[:, columns] for name, x in storage.items()}
+        self.storage = tree_map(lambda x: x[:, columns], storage)
 
-    def rollout(self, iteration: int, restart: bool, rebuild: bool) -> tuple[dict, Optional[str]]:
-        """Returns the sums that `rollout` returns, and None or what is wrong with the simulation's numbers. All random
-        numbers follow from the seed, the iteration and the actor."""
-        args = self.args
-        seed_all(args.seed, iteration, RANK, self.index)
-        if restart:
-            seeds = np.random.SeedSequence([args.seed, iteration, RANK]).generate_state(args.num_envs)
-            seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
-            options = dict(reconfigure=True) if rebuild else None
-            with torch.no_grad():
-                self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
-        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, args, self.act)
+    def rollout(self, iteration: int, is_first: bool) -> dict:
+        """A rollout of this actor's environments; returns the sums that `rollout` returns. All random numbers follow
+        from the seed, the iteration and the actor."""
+        seed_all(self.args.seed, iteration, RANK, self.index)
+        if is_first or iteration % self.rebuild_freq == 0:
+            self.start_all_episodes(iteration)
+        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act)
+        if (iteration + 1) % self.rebuild_freq == 0:
+            self.finish_all_episodes(sums)
+        return sums
 
-        shape, floats = self.storage["rewards"].shape, [x for x in self.storage.values() if x.is_floating_point()]
-        is_broken = ~torch.stack([x.isfinite().reshape(*shape, -1).all(2).all(0) for x in floats]).all(0)
-        if not is_broken.any():
-            return sums, None
-        broken = is_broken.nonzero().flatten()
-        can_choose = self.resets_some and not args.reconfiguration_freq  # ManiSkill rebuilds all scenes at once
-        self.obs, _ = self.envs.reset(options=dict(env_idx=broken) if can_choose else None)
-        return sums, f"non-finite observation or reward in environments {(broken + self.env_idx.start).tolist()}"
+    @torch.no_grad()
+    def start_all_episodes(self, iteration: int) -> None:
+        seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
+        seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+        options = dict(reconfigure=True) if self.rebuild_freq < math.inf else None
+        self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
+
+    @torch.no_grad()
+    def finish_all_episodes(self, sums: dict) -> None:
+        """Play the running episodes to their ends, so that new scenes cut none. PPO does not learn from these steps."""
+        running = self.envs.base_env.elapsed_steps > 0
+        while running.any():
+            action = self.agent.clip_action(self.act(self.obs)[0])
+            self.obs, _, terminated, truncated, infos = self.envs.step(action)
+            ended = running & (terminated | truncated)
+            if ended.any():
+                add_episodes(sums, infos["final_info"], ended)
+            running = running & ~ended
 
     def evaluate(self, num_episodes: int, seed: int, num_steps: int) -> dict[str, torch.Tensor]:
-        """This actor's part of the episodes from `seed` on."""
-        episodes = part(num_episodes, self.index, self.args.num_actors)
+        """This actor's share of the episodes from `seed` on."""
+        episodes = even_share(num_episodes, self.index, self.args.num_actors)
         first_seed, rebuild_freq = seed + episodes.start, evaluation_rebuild_freq(self.args)
         return evaluate(self.agent, self.eval_envs, len(episodes), first_seed, num_steps, rebuild_freq, self.separately)
 
@@ -1559,18 +1577,40 @@ def end_with_main_process() -> None:
 class Actors:
     """Actor 0 in this process and, with CPU simulation, each further one in a process of its own."""
 
-    def __init__(self, args: Args, trajectory_dir: Path):
-        # Processes inherit this: they ignore these signals, and the main process tells them when to stop.
-        handlers = {s: signal.signal(s, signal.SIG_IGN) for s in STOP_SIGNALS}
+    def __init__(self, args: Args, trajectory_dir: Path, closing: contextlib.ExitStack):
+        # Processes inherit this: they ignore these signals, and the main process ends them.
+        handlers = set_stop_handlers(signal.SIG_IGN)
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
         self.built = [
             pool.submit(run_in_actor, "build", args, i, trajectory_dir) for i, pool in enumerate(self.pools, 1)
         ]
         for s, handler in handlers.items():
             signal.signal(s, handler)
-        self.local = Actor(args, 0, trajectory_dir)
+        self.args, self.local = args, Actor(args, 0, trajectory_dir)
+        closing.callback(self.close)
         if not args.evaluate:
-            check_task(args, self.local.envs, self.local.resets_some)
+            check_task(args, self.local.envs)
+        envs = self.local.eval_envs
+        self.device, self.spaces = envs.device, (envs.single_observation_space, envs.single_action_space)
+        self.num_eval_episodes, self.max_eval_steps = evaluation_size(envs, args)
+
+    def share_memory(self, agent: nn.Module, device: torch.device) -> dict:
+        """Give all actors the agent and, to train, a storage to write into: the tensors themselves, or a copy if the
+        learner is on another device. Returns the learner's storage: tensors (num_steps, num_envs, ...)."""
+        args, has_copies = self.args, self.device.type != device.type
+        self.learner, self.agent = agent, copy.deepcopy(agent).to(self.device) if has_copies else agent
+        self.storage = {} if args.evaluate else make_storage(*self.spaces, args, self.device, device)
+        self.learner_storage = tree_map(lambda x: x.to(device), self.storage) if has_copies else self.storage
+        if self.pools:
+            for x in tree_leaves([dict(self.agent.state_dict()), self.storage]):
+                x.share_memory_()
+        self.call("receive", self.agent, self.storage)
+        self.built = []
+        if args.compile:  # only now: a compiled function cannot be sent to other actors
+            for network in {self.learner, self.agent}:  # on one device they are the same
+                network.get_action_and_value = torch.compile(network.get_action_and_value, dynamic=False)
+        self.local.act = CudaGraph(self.agent.get_action_and_value, args, self.device)
+        return self.learner_storage
 
     def call(self, method: str, *arguments) -> list:
         """Call a method of all actors at the same time; returns their results in order."""
@@ -1580,42 +1620,64 @@ class Actors:
         except BrokenProcessPool:
             raise RunError("the process of an actor died (killed? out of memory?)") from None
 
-    def connect(self, agent, storage: Optional[dict] = None) -> None:
-        """Share the agent and the storage with all actors: the tensors themselves, not copies."""
-        if self.pools:
-            tensors = [*agent.state_dict().values(), *(storage or {}).values()]
-            check_shared_memory(sum(x.numel() * x.element_size() for x in tensors))
-            for x in tensors:
-                x.share_memory_()
-        self.call("connect", agent, storage)
-        self.built = []
+    def refresh(self) -> None:
+        """Let the actors act with what the learner has learned."""
+        if self.agent is not self.learner:
+            self.agent.load_state_dict(self.learner.state_dict())
+
+    def rollout(self, iteration: int, is_first: bool) -> list[dict]:
+        """Fill the storage; returns sums over the episodes that ended, of each actor."""
+        self.refresh()
+        sums_of_actors = self.call("rollout", iteration, is_first)
+        for x in tree_leaves(self.storage):
+            broken = (~x.isfinite()).nonzero() if x.is_floating_point() else ()
+            if len(broken):
+                raise RunError(f"the simulation gave NaN or infinity in environments {broken[:, 1].unique().tolist()}")
+        if self.learner_storage is not self.storage:
+            tree_map(lambda new, old: new.copy_(old), self.learner_storage, self.storage)
+        return sums_of_actors
+
+    def evaluate(self, seed: int) -> dict[str, torch.Tensor]:
+        """The episodes from `seed` on, of all actors and processes: see the function `evaluate`."""
+        self.refresh()
+        seed += RANK * self.num_eval_episodes
+        episodes = concatenate(self.call("evaluate", self.num_eval_episodes, seed, self.max_eval_steps))
+        return concatenate(all_gather(episodes))
 
     def close(self) -> None:
-        self.call("close")
+        has_failed = sys.exc_info()[0] is not None
+        if not has_failed:  # else `main` ends the processes, whatever they are doing
+            self.call("close")
         for pool in self.pools:
-            pool.shutdown()
+            pool.shutdown(wait=not has_failed)
 
 
-def check_shared_memory(needed: int) -> None:
-    """Refuse a run that does not fit into shared memory: Linux would end it with 'Bus error' and nothing else."""
-    free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else math.inf
-    if needed > free:
-        fail(f"this run needs {needed / 2**20:,.0f} MiB of shared memory, and {free / 2**20:,.0f} are free: give the "
-             "container more (--shm-size), or use fewer environments or steps, or --num_actors 1")  # fmt: skip
+def make_storage(obs_space, action_space, args: Args, device: torch.device, learner_device: torch.device) -> dict:
+    """Buffers of a rollout, (num_steps, num_envs, ...) each; observations are a tensor or a dict, like their space.
+    Refuses what does not fit: Linux would end the run without a word, or with 'Bus error' alone."""
+
+    def empty(shape=(), dtype="float32"):
+        return torch.empty(args.num_steps, args.num_envs, *shape, dtype=getattr(torch, dtype), device="meta")
+
+    storage = {name: empty() for name in ("logprobs", "rewards", "dones", "values", "next_values")}
+    obs_spaces = getattr(obs_space, "spaces", obs_space)  # of a dict, or of one tensor
+    storage["obs"] = tree_map(lambda space: empty(space.shape, space.dtype.name), obs_spaces)
+    storage["actions"] = empty(action_space.shape)
+
+    free = {"memory": psutil.virtual_memory().available / LOCAL_WORLD_SIZE}
+    if args.num_actors > 1 and Path("/dev/shm").exists():
+        free["shared memory (docker run --shm-size; --num_actors 1 needs none)"] = shutil.disk_usage("/dev/shm").free
+    if learner_device.type == "cuda":
+        free["the GPU's memory"] = torch.cuda.mem_get_info(learner_device)[0]
+    needed = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
+    for place, size in free.items():
+        if needed > 0.9 * size:
+            fail(f"a rollout needs {needed / 2**20:,.0f} MiB, and {size / 2**20:,.0f} MiB of {place} are free: try "
+                 f"--num_steps {args.num_steps // 2}, fewer --num_envs or, if it has images, smaller ones")  # fmt: skip
+    return tree_map(lambda x: torch.zeros_like(x, device=device), storage)
 
 
 # ----- Checkpoints ----------------------------------------------------------------------------------------------------
-
-
-def save_checkpoint(path: Path, contents: dict) -> None:
-    """Write another file, then rename it: at any moment `path` is the old checkpoint or the new one, whole."""
-    with open(path.with_suffix(".tmp"), "wb") as file:
-        torch.save(contents, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, path)
-
-
 def find_checkpoint(path: str | Path) -> Path:
     """A run folder stands for its last.pt."""
     return Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
@@ -1625,7 +1687,7 @@ def load_checkpoint(path: str | Path) -> dict:
     path = find_checkpoint(path)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        if not {"agent", "optimizer", "args", "finished"} <= checkpoint.keys():
+        if not {"agent", "optimizer", "args", "obs_spaces", "finished"} <= checkpoint.keys():
             raise ValueError("it was written by another version of this script")
     except FileNotFoundError:
         fail(f"there is no checkpoint {path}")
@@ -1635,25 +1697,33 @@ def load_checkpoint(path: str | Path) -> dict:
 
 
 def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path) -> None:
-    """Give the agent the weights of a checkpoint, or refuse those of another network."""
-    found, wanted = checkpoint["agent"], agent.state_dict()
-    for name in {**wanted, **found}:
-        shapes = [tuple(x[name].shape) if name in x else "nothing" for x in (found, wanted)]
-        if shapes[0] != shapes[1]:
-            fail(f"{path} is of another network or task: {name} is {shapes[0]} there, {shapes[1]} here")
-    agent.load_state_dict(found)
+    try:
+        agent.load_state_dict(checkpoint["agent"])
+    except RuntimeError as error:
+        fail(f"{path} is of another network or task: {error}")
+
+
+def make_agent(obs_space, action_space, args: Args, checkpoint: dict) -> Agent:
+    """An agent with the weights of the checkpoint or, without one, of the seed: the same in all processes."""
+    seed_all(args.seed)  # whatever the environments drew
+    agent = Agent(obs_space, action_space, args)
+    if checkpoint:
+        load_weights(agent, checkpoint, args.resume or args.checkpoint)
+    agent.load_state_dict(all_gather(agent.state_dict())[0])  # machines may turn a seed into different weights
+    return agent
 
 
 def load_agent(path: str | Path) -> tuple[Agent, Args]:
     """A trained policy for your own program: the agent, on the CPU, and the flags of its run.
 
-    agent.get_action(obs) returns the actions (batch, act_dim) for observations as ImageObservations makes them.
+    agent.get_action(obs) returns the actions (batch, act_dim) for observations as `Agent` describes them.
     make_envs(args, num_envs, seed, evaluation=True) builds environments that fit."""
     checkpoint = load_checkpoint(path)
     args, weights = Args(**checkpoint["args"]), checkpoint["agent"]
     spaces = {k: gym.spaces.Box(0, 1, shape, dtype) for k, (shape, dtype) in checkpoint["obs_spaces"].items()}
+    obs_space = spaces["obs"] if "obs" in spaces else gym.spaces.Dict(spaces)
     action_space = gym.spaces.Box(weights["action_low"].numpy(), weights["action_high"].numpy())
-    agent = Agent(gym.spaces.Dict(spaces), action_space, args)
+    agent = Agent(obs_space, action_space, args)
     load_weights(agent, checkpoint, path)
     return agent.eval(), args
 
@@ -1661,15 +1731,21 @@ def load_agent(path: str | Path) -> tuple[Agent, Args]:
 class Checkpoints:
     """Writes last.pt, numbered checkpoints and best.pt. Closing it writes last.pt, however the run ends."""
 
-    def __init__(self, args: Args, run_dir: Path, resumed: dict):
-        self.args, self.run_dir, self.contents, self.last_time = args, run_dir, {}, time.monotonic()
-        self.best_score = resumed.get("best_score", [-math.inf])
+    def __init__(self, args: Args, run_dir: Path, resumed: dict, agent, optimizer, obs_space, logger: "Logger"):
+        self.args, self.run_dir, self.logger, self.last_time = args, run_dir, logger, time.monotonic()
+        self.learner = dict(agent=agent, optimizer=optimizer)
+        self.run_info = dict(args=asdict(args), world_size=WORLD_SIZE, wandb_id=logger.wandb_id)
+        obs_spaces = getattr(obs_space, "spaces", {"obs": obs_space})  # of a dict of images and state, or of a tensor
+        self.run_info["obs_spaces"] = {k: (tuple(x.shape), x.dtype.name) for k, x in obs_spaces.items()}
+        self.contents, self.best_score = {}, resumed.get("best_score", [-math.inf])
         if resumed and (run_dir / "best.pt").exists():  # it may be newer than the checkpoint
             self.best_score = max(self.best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
 
-    def update(self, contents: dict) -> None:
-        """Take the state of an iteration, and write it if it is due."""
-        self.contents, iteration = contents | dict(best_score=self.best_score), contents["iteration"]
+    def take(self, iteration: int, global_step: int) -> None:
+        """Copy the state from which a resumed run goes on, and write it if that is due."""
+        state = copy.deepcopy({name: x.state_dict() for name, x in self.learner.items()})
+        progress = dict(iteration=iteration, global_step=global_step, finished=False, best_score=self.best_score)
+        self.contents = state | progress | self.run_info | dict(metrics_size=self.logger.file.tell())
         is_old = time.monotonic() - self.last_time > 60 * self.args.checkpoint_minutes and not self.args.exact_resume
         if iteration % self.args.checkpoint_freq == 0 or is_old:
             self.write("last.pt")
@@ -1678,14 +1754,19 @@ class Checkpoints:
             self.write(f"iteration_{iteration}.pt")
 
     def update_best(self, score: list[float]) -> None:
-        """Write best.pt if this score, success rate first, is the best so far."""
+        """Write best.pt if this score is the best so far: of two scores, the first number that differs decides."""
         if score > self.best_score and all(map(math.isfinite, score)):
             self.best_score = self.contents["best_score"] = score
             self.write("best.pt")
 
     def write(self, name: str) -> None:
+        """Write another file, then rename it: at any moment there is the old checkpoint or the new one, whole."""
         if self.args.save_model:
-            save_checkpoint(self.run_dir / name, self.contents)
+            with open(self.run_dir / name.replace(".pt", ".tmp"), "wb") as file:
+                torch.save(self.contents, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(file.name, self.run_dir / name)
 
     def close(self) -> None:
         # with exact_resume, a run goes on from every checkpoint_freq-th iteration only
@@ -1693,44 +1774,7 @@ class Checkpoints:
             self.write("last.pt")
 
 
-def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.optim.Optimizer:
-    """Adam with one group each for the policy's mean, its standard deviation and the critic."""
-    special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
-    actor = [p for p in agent.parameters() if id(p) not in special]
-    critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
-    adapts = args.desired_kl is not None
-    groups = [
-        dict(params=actor, initial_lr=args.learning_rate, adapts=adapts),
-        dict(params=[agent.actor_logstd], initial_lr=args.learning_rate * args.logstd_lr_factor, adapts=adapts),
-        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, adapts=False),
-    ]
-    for group in groups:
-        group["lr"] = torch.tensor(group["initial_lr"], device=device)  # where a CUDA graph reads it
-    return torch.optim.Adam(groups, eps=1e-5, fused=True, capturable=device.type == "cuda")
-
-
-def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
-    """Load Adam's moments, and each learning rate as far as it was adapted, unless its flag has changed."""
-    flags = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
-    optimizer.load_state_dict(saved)
-    for group, flag in zip(optimizer.param_groups, flags):
-        if group["adapts"] and flag["adapts"] and group["initial_lr"] == flag["initial_lr"]:
-            flag["lr"].copy_(group["lr"])
-        group.update(flag)
-
-
-def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
-    """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
-    less than half of it (Rudin et al. 2022, arXiv 2109.11978), between a hundredth and ten times of the initial one."""
-    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
-    for group in optimizer.param_groups:
-        if group["adapts"]:
-            group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
-
-
 # ----- Logging --------------------------------------------------------------------------------------------------------
-
-
 class Logger:
     """metrics.jsonl, TensorBoard, Weights & Biases, the learning curve, and the progress bar or lines instead."""
 
@@ -1738,36 +1782,38 @@ class Logger:
         from torch.utils.tensorboard import SummaryWriter  # slow to import, and the other actors need none
 
         run_dir.mkdir(parents=True, exist_ok=True)
-        self.run_dir, self.lock, self.wandb_run, self.last_line = run_dir, lock_run(run_dir), None, time.monotonic()
+        self.run_dir, self.wandb_id, self.last_line = run_dir, None, time.monotonic()
+        self.lock = filelock.FileLock(run_dir / ".lock")
+        try:
+            self.lock.acquire(timeout=0)
+        except filelock.Timeout:
+            fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
         path, size = run_dir / "metrics.jsonl", resumed.get("metrics_size", 0)  # later steps are done again
         path.touch()
         path.write_bytes(path.read_bytes()[:size])
         self.file = open(path, "a")
-        global_step = resumed.get("global_step", 0)
-        self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
         hardware = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{num_cores()} CPU core(s)"
         packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
         versions = {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in packages}
-        about = dict(args=asdict(args), versions=versions, device=hardware, command=shlex.join(sys.argv))
-        (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
+        run_info = dict(args=asdict(args), versions=versions, device=hardware, command=shlex.join(sys.argv))
+        (run_dir / "args.json").write_text(json.dumps(run_info, indent=2) + "\n")
         if args.track and RANK == 0:
             import wandb
 
-            self.wandb_run = wandb.init(
+            wandb.init(
                 project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
-                config=about, save_code=True, id=resumed.get("wandb_id"), resume="allow",
+                config=run_info, save_code=True, id=resumed.get("wandb_id"), resume="allow", sync_tensorboard=True,
             )  # fmt: skip
-        self.wandb_id = self.wandb_run and self.wandb_run.id
+            self.wandb_id = wandb.run.id
+        global_step = resumed.get("global_step", 0)
+        self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
         self.bar = tqdm(
             total=args.num_iterations * args.batch_size, initial=global_step, dynamic_ncols=True,
             disable=None if RANK == 0 else True,  # None: no bar where there is no terminal
             bar_format="{percentage:3.0f}%|{bar:20}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}",
         )  # fmt: skip
-        self.print(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {hardware}")
-        self.print(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
-
-    def print(self, line: str) -> None:
-        self.bar.write(line)
+        tqdm.write(f"{args.env_id}: {args.num_envs} environments on {args.sim_backend}, learning on {hardware}")
+        tqdm.write(f"resuming {run_dir} at step {global_step:,}" if resumed else f"writing to {run_dir}")
 
     def log(self, kind: str, global_step: int, metrics: dict) -> None:
         finite = {k: v for k, v in metrics.items() if math.isfinite(v)}
@@ -1775,12 +1821,10 @@ class Logger:
         self.file.flush()
         for key, value in finite.items():
             self.writer.add_scalar(f"{kind}/{key}", value, global_step)
-        if self.wandb_run:
-            self.wandb_run.log({f"{kind}/{k}": v for k, v in finite.items()}, step=global_step)
         names = {"success_once": "success", "return": "return", "episode_len": "length"}
         summary = [f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics]
         if kind == "eval":
-            self.print(f"step {global_step:>9,}  evaluation: {', '.join(summary)}")
+            tqdm.write(f"step {global_step:>9,}  evaluation: {', '.join(summary)}")
             if global_step > 0:
                 plot_learning_curve(self.run_dir)
             return
@@ -1791,48 +1835,28 @@ class Logger:
             print(f"step {global_step:>9,}  training: {status}", flush=True)
             self.last_line = time.monotonic()
 
-    def memory(self) -> dict:
-        """In MiB: of this process, of its actors, and of the whole GPU."""
-        children = sum(psutil.Process(child.pid).memory_info().rss for child in mp.active_children())
-        memory = dict(memory_mb=psutil.Process().memory_info().rss / 2**20, actors_memory_mb=children / 2**20)
-        if torch.cuda.is_initialized():
-            free, total = torch.cuda.mem_get_info()
-            memory["gpu_memory_mb"] = (total - free) / 2**20
-        return memory
-
     def close(self) -> None:
         for resource in (self.bar, self.writer, self.file):
             resource.close()
-        if self.wandb_run:
-            self.wandb_run.finish(exit_code=int(sys.exc_info()[0] is not None))
+        if self.wandb_id:
+            import wandb
+
+            wandb.finish(exit_code=int(sys.exc_info()[0] is not None))
         self.lock.release()
-
-
-def lock_run(run_dir: Path) -> filelock.FileLock:
-    """Two processes that resume one run would write every row twice."""
-    lock = filelock.FileLock(run_dir / ".lock")
-    try:
-        lock.acquire(timeout=0)
-    except filelock.Timeout:
-        fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
-    return lock
 
 
 def plot_learning_curve(run_dir: Path) -> None:
     """Draw learning_curve.png from metrics.jsonl: success, if the task has it, and return over steps."""
     from matplotlib.figure import Figure
 
-    points = defaultdict(list)
-    for row in map(json.loads, (run_dir / "metrics.jsonl").read_text().splitlines()):
-        for key in row.keys() & {"success_once", "return"}:
-            points[key, row["kind"]].append((row["global_step"], row[key]))
-    keys = sorted({key for key, _ in points}, reverse=True)
+    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    keys = [key for key in ("success_once", "return") if key in rows[0]]
     figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
-    for axis, key in zip(np.atleast_1d(figure.subplots(1, len(keys))), keys):
-        if (key, "train") in points:
-            axis.plot(*zip(*points[key, "train"]), label="training", alpha=0.4)
-        axis.plot(*zip(*points[key, "eval"]), label="evaluation", marker="o", markersize=3)
-        axis.set(title=key, xlabel="environment steps", ylim=(-0.03, 1.03) if key == "success_once" else None)
+    for axis, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys):
+        for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
+            points = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind and key in row]
+            axis.plot(*zip(*points or [(0, math.nan)]), label=kind, **style)
+        axis.set(title=key, xlabel="environment steps")
         axis.legend()
     figure.savefig(run_dir / "learning_curve.png", dpi=120)
     del figure, axis
@@ -1841,18 +1865,16 @@ def plot_learning_curve(run_dir: Path) -> None:
 
 def average_episodes(sums_of_actors: list[dict]) -> dict:
     """Means over the episodes that ended in all actors and processes, and their number."""
-    sums = Counter()
+    total = Counter()
     on_host = [dict(zip(x, torch.stack([*x.values()]).tolist())) for x in sums_of_actors]
-    for sums_of_actor in sum(gather(on_host), []):
-        sums.update(sums_of_actor)
-    num_episodes = int(sums.pop("num_episodes"))
-    means = {key: x / num_episodes for key, x in sums.items()} if num_episodes else {}
+    for sums in sum(all_gather(on_host), []):
+        total.update(sums)
+    num_episodes = int(total.pop("num_episodes"))
+    means = {key: x / num_episodes for key, x in total.items()} if num_episodes else {}
     return means | dict(num_episodes=num_episodes)
 
 
 # ----- CUDA graphs, several processes ---------------------------------------------------------------------------------
-
-
 class CudaGraph:
     """A function that is launched as one CUDA graph: small networks compute faster than Python launches their kernels.
 
@@ -1894,8 +1916,8 @@ class CudaGraph:
         self.graph = self.function = None  # NCCL waits for graphs that contain its operations
 
 
-def start_processes(args: Args, closing: contextlib.ExitStack) -> tuple[torch.device, Path]:
-    """Connect the processes that torchrun started; returns the device and the folder of this one."""
+def start_processes(args: Args, closing: contextlib.ExitStack) -> tuple[Args, Args, torch.device, Path]:
+    """Connect the processes of torchrun; returns the flags of all, the flags of this one, its device and its folder."""
     torch.backends.cudnn.deterministic = args.torch_deterministic
     device = choose_device(local_args(args))
     if device.type == "cuda":
@@ -1903,31 +1925,27 @@ def start_processes(args: Args, closing: contextlib.ExitStack) -> tuple[torch.de
     if WORLD_SIZE > 1:
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
         closing.callback(dist.destroy_process_group)
+    run_dir = find_run_dir(args)
     if RANK > 0:  # only the first process writes the run
-        return device, Path(closing.enter_context(tempfile.TemporaryDirectory()))
-    return device, find_run_dir(args)
+        run_dir = Path(closing.enter_context(tempfile.TemporaryDirectory()))
+    args = all_gather(args)[0]  # all need the same, and defaults depend on the machine
+    return args, local_args(args), device, run_dir
 
 
 def local_args(args: Args) -> Args:
     """The flags for one of the processes that torchrun started: its part of the environments, on its own GPU."""
     if WORLD_SIZE == 1:
         return args
-    local = replace(
-        args,
-        num_envs=args.num_envs // WORLD_SIZE,
-        num_actors=max(1, args.num_actors // WORLD_SIZE),
-        num_eval_envs=math.ceil(args.num_eval_envs / WORLD_SIZE),
-        num_eval_episodes=math.ceil(args.num_eval_episodes / WORLD_SIZE),
-    )
+    names = ("num_envs", "num_actors", "num_eval_envs", "num_eval_episodes")
+    local = replace(args, **{name: math.ceil(getattr(args, name) / WORLD_SIZE) for name in names})
     if args.sim_backend == "physx_cuda":
         local.sim_backend = f"physx_cuda:{LOCAL_RANK}"
     if RANK > 0:  # only the first process writes
-        local.capture_video = local.save_trajectory = local.save_model = False
-        local.save_train_video_freq = None
+        local.save_model = local.save_trajectory = local.capture_video = local.save_train_video_freq = False
     return local
 
 
-def average(x: torch.Tensor) -> torch.Tensor:
+def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:
     """Mean of a tensor over all processes, in place."""
     if WORLD_SIZE > 1:
         dist.all_reduce(x)
@@ -1939,12 +1957,12 @@ def average_gradients(agent: nn.Module) -> None:
     """Average all gradients over all processes, in one message."""
     if WORLD_SIZE > 1:
         grads = [p.grad for p in agent.parameters() if p.grad is not None]
-        means = average(torch.cat([grad.flatten() for grad in grads])).split([grad.numel() for grad in grads])
+        means = all_reduce_mean(torch.cat([grad.flatten() for grad in grads])).split([grad.numel() for grad in grads])
         for grad, mean in zip(grads, means):
             grad.copy_(mean.view(grad.shape))
 
 
-def gather(x) -> list:
+def all_gather(x) -> list:
     """What each process has, in the order of their ranks."""
     everything = [x] * WORLD_SIZE
     if WORLD_SIZE > 1:
@@ -1958,14 +1976,7 @@ def num_cores() -> int:
     return max(1, cores // LOCAL_WORLD_SIZE)
 
 
-def num_update_threads() -> int:
-    """All cores. In ppo.py, with its small layers, half of them are faster."""
-    return num_cores()
-
-
 # ----- Command line ---------------------------------------------------------------------------------------------------
-
-
 SCRIPT = Path(__file__)
 
 
@@ -1979,32 +1990,25 @@ class RunError(RuntimeError):
     """Ends a run with one line, without a traceback."""
 
 
-# These fix the task and the network: a resumed run cannot change them, and --checkpoint brings them along.
-FIXED_FLAGS = (
-    "env_id", "obs_mode", "control_mode", "robot_uids", "reward_mode", "env_kwargs", "eval_partial_reset", "norm_obs",
-    "include_state", "frame_stack", "camera_width", "camera_height", "shader", "encoder",
-)  # fmt: skip
-
-
 def parse_args(argv: list[str]) -> Args:
     """The command line as Args. Defaults depend on the simulation backend; a checkpoint brings its task and network, a
     run to resume all its flags."""
-    given = parse_flags([arg for arg in argv if arg not in ("-h", "--help")], Args())
-    default = Args()
+    description = f"{__doc__.splitlines()[0]} The defaults are those of this machine."
+    parse = partial(tyro.cli, Args, prog=SCRIPT.name, description=description)
+    given, default = parse(args=[arg for arg in argv if arg not in ("-h", "--help")]), Args()
     if choose_backend(given) == "physx_cpu":
         num_envs = CPU_ENVS_PER_CORE * num_cores() * WORLD_SIZE
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
-    resumes = given.resume is not None
-    if resumes and (given.evaluate or given.checkpoint):
+    if given.resume is not None and (given.evaluate or given.checkpoint):
         fail("--resume continues a run: leave out --evaluate and --checkpoint")
-    path = given.resume if resumes else given.checkpoint
+    path = given.checkpoint if given.resume is None else given.resume
     if path is not None:
         checkpoint = load_checkpoint(path)
         run = checkpoint["args"]
-        default = replace(default, **{k: run[k] for k in (run if resumes else FIXED_FLAGS)})
-    args = parse_flags(argv, default)
+        default = replace(default, **{k: run[k] for k in (FIXED_FLAGS if given.resume is None else run)})
+    args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
         args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
@@ -2013,37 +2017,12 @@ def parse_args(argv: list[str]) -> Args:
         args.num_actors = max(1, min(cores, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
-    if resumes:
+    if args.resume is not None:
         args.resume = str(find_checkpoint(path))
         check_resume(args, checkpoint)
     elif path is not None:
         args.checkpoint = str(find_checkpoint(path))
     return args
-
-
-def parse_flags(argv: list[str], default: Args) -> Args:
-    """tyro shows the base classes of Args as groups of flags."""
-    names = asdict(default)
-    for arg in argv:
-        name = arg.partition("=")[0].removeprefix("--").removeprefix("no-").replace("-", "_")
-        if arg.startswith("--") and name not in ("help", *names):
-            near = difflib.get_close_matches(name, names) or ["help"]
-            fail(f"there is no flag {arg}; similar: {', '.join(f'--{flag}' for flag in near)}")
-    groups = {cls.__name__.removesuffix("Args"): cls for cls in reversed(Args.__bases__)}
-    values = {name: cls(**{k: names[k] for k in cls.__dataclass_fields__}) for name, cls in groups.items()}
-    Groups = make_dataclass("Groups", groups.items())
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            about = __doc__.splitlines()[0] + " The defaults are those of this machine."
-            config = (tyro.conf.OmitArgPrefixes,)
-            parsed = tyro.cli(Groups, args=argv, default=Groups(**values), config=config, description=about)
-    except SystemExit as error:
-        if error.code == 0:  # --help
-            raise
-        message = errors.getvalue().partition("\n")[2].partition("│ ──")[0]  # of a box with a title and a footer
-        fail(re.sub("[│╰╯─]+", " ", message) + " (see --help)")
-    return Args(**{k: v for name in groups for k, v in vars(getattr(parsed, name)).items()})
 
 
 def check_resume(args: Args, checkpoint: dict) -> None:
@@ -2087,21 +2066,6 @@ def choose_device(args: Args) -> torch.device:
     return torch.device("cpu")
 
 
-LIMITS = (  # of numbers, if given; none may be infinite or not a number
-    (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
-              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
-    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale checkpoint_minutes"),
-    (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq "
-              "reconfiguration_freq eval_reconfiguration_freq"),
-    (0, 1, "gamma gae_lambda stop_at_success"),
-    (0, 2**30, "eval_seed"),
-    (-20, 5, "logstd_init"),
-    (1, 32, "frame_stack"),
-    (8, 4096, "camera_width camera_height"),
-    (0, 32, "random_shift"),
-)  # fmt: skip
-
-
 def check(args: Args) -> None:
     """Refuse what cannot work, before anything is built or written."""
     for low, high, flags in LIMITS:
@@ -2123,12 +2087,23 @@ def check(args: Args) -> None:
         fail("--track needs Weights & Biases: pip install wandb")
     if WORLD_SIZE > 1 and args.evaluate:
         fail("--evaluate is for one process: leave out torchrun")
+    check_task_exists(args)
+    check_simulation(args)
+    check_observations(args)
+    run_dir = find_run_dir(args)
+    if not (args.resume or args.evaluate) and os.path.exists(run_dir / "metrics.jsonl"):
+        fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
+
+
+def check_task_exists(args: Args) -> None:
     try:
         find_task(args.env_id)
     except KeyError:
         near = ", ".join(difflib.get_close_matches(args.env_id, REGISTERED_ENVS)) or "none"
         fail(f"--env_id {args.env_id}: no such task; similar: {near}; a task in your own file is module:{args.env_id}")
-    except Exception as error:  # in the user's module
+    except Exception as error:
+        if not is_from_packages(error):  # a mistake in the task's module: show where
+            raise
         fail(f"--env_id {args.env_id}: {describe(error)}")
     try:
         env_kwargs = dict(**json.loads(args.env_kwargs))
@@ -2137,17 +2112,10 @@ def check(args: Args) -> None:
     for k in env_kwargs:
         if hasattr(args, k):
             fail(f"--env_kwargs: {k} has its own flag: --{k}")
-    check_simulation(args)
-    check_observations(args)
-    run_dir = find_run_dir(args)
-    if args.resume and RANK == 0:
-        lock_run(run_dir).release()
-    if not (args.resume or args.evaluate) and os.path.exists(run_dir / "metrics.jsonl"):
-        fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
 
 
 def check_simulation(args: Args) -> None:
-    """Refuse a GPU that is not there, or cannot be used."""
+    """Refuse flags that do not fit the simulation, and a GPU that is not there or cannot be used."""
     on_gpu = args.sim_backend != "physx_cpu"
     if on_gpu and args.num_actors > WORLD_SIZE:
         fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
@@ -2165,10 +2133,9 @@ def check_simulation(args: Args) -> None:
                     sapien.physx.enable_gpu()
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]
-            if on_gpu or WORLD_SIZE > 1:
+            if on_gpu or torch.cuda.is_available():
                 remedy = "link libcuda.so.1 as libcuda.so" if "libcuda" in reason else "see examples/check_machine.py"
-                fail(f"--sim_backend {args.sim_backend}: {reason}: {remedy}, or use --sim_backend physx_cpu")
-            args.cuda = False
+                fail(f"--sim_backend {args.sim_backend}: {reason}: {remedy}, or use --sim_backend physx_cpu --no-cuda")
             print(f"the GPU is not used: {reason}")
     try:
         parse_backends(args.sim_backend, args.render_backend)
@@ -2176,49 +2143,25 @@ def check_simulation(args: Args) -> None:
         fail(f"--sim_backend {args.sim_backend} --render_backend {args.render_backend}: {error}")
 
 
-TO_RENDER = "CPU: apt install mesa-vulkan-drivers, 23.1 or newer; GPU: NVIDIA_DRIVER_CAPABILITIES=all in a container"
-
-
-def check_observations(args: Args) -> None:
-    """Refuse images that nothing can render."""
-    textures = args.obs_mode.split("+")
-    if not set(textures) <= TEXTURES.keys() or len(set(textures)) < len(textures):
-        fail(f"--obs_mode {args.obs_mode}: must be some of {', '.join(TEXTURES)}, joined by +")
-    needs_default = "normal" in textures or "albedo" in textures
-    if args.shader is None:
-        args.shader = "default" if needs_default else "minimal"
-    if args.shader == "minimal" and needs_default:
-        fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
-    if args.render_backend == "none":
-        fail("--render_backend none: images must be rendered; ppo.py learns from the state")
-    on_gpu = args.sim_backend != "physx_cpu"
-    if RENDER_DEVICE is None or (on_gpu and not RENDER_DEVICE.is_cuda()):
-        fail(f"there is no Vulkan device to render images: {TO_RENDER}; ppo.py learns from the state")
-
-
-# ----- Stopping, main -------------------------------------------------------------------------------------------------
-
-
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
+PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # where they lie
 
 
-class StopSignals:
-    """The first signal stops the run after the iteration, the second one at once."""
+def set_stop_handlers(handler) -> dict:
+    """Returns the handlers that were set before."""
+    return {s: signal.signal(s, handler) for s in STOP_SIGNALS}
 
-    def __enter__(self):
-        self.received = 0
-        self.handlers = {s: signal.signal(s, self.receive) for s in STOP_SIGNALS}
-        return self
 
-    def receive(self, signum, frame) -> None:
-        self.received = signum
-        for s in STOP_SIGNALS:
-            signal.signal(s, signal.SIG_DFL)
-        os.write(2, f"\n{signal.Signals(signum).name}: stopping after this iteration; again: at once\n".encode())
+def stop(signum: int, frame) -> NoReturn:
+    """End the run here, with what it had learned when the iteration began."""
+    set_stop_handlers(signal.SIG_IGN)  # torchrun sends a second one
+    raise KeyboardInterrupt(signum)
 
-    def __exit__(self, *error) -> None:
-        for s, handler in self.handlers.items():
-            signal.signal(s, handler)
+
+def is_from_packages(error: BaseException) -> bool:
+    """Whether nothing but installed packages, called by this script, raised it."""
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    return all(file == __file__ or file.startswith(PACKAGES) for file in files)
 
 
 def describe(error: BaseException) -> str:
@@ -2235,32 +2178,43 @@ def main(argv: list[str]) -> int:
         sys.stdout = open(os.devnull, "w")
     args = parse_args(argv)
     check(args)
-    run_dir, code = find_run_dir(args), 1
+    run_dir, code = find_run_dir(args), 0
+    handlers = set_stop_handlers(stop)
     try:
         with contextlib.ExitStack() as closing:
-            code = (evaluate_checkpoint if args.evaluate else train)(args, closing)
-    except KeyboardInterrupt:
-        code = 130
+            try:
+                (evaluate_checkpoint if args.evaluate else train)(args, closing)
+            finally:  # from here on, a signal must not keep last.pt from being written
+                set_stop_handlers(signal.SIG_IGN)
+    except KeyboardInterrupt as interrupt:
+        code = 128 + interrupt.args[0]
+        print(f"{SCRIPT.name}: stopped by {signal.Signals(interrupt.args[0]).name}", file=sys.stderr)
     except Exception as error:
-        if not os.path.exists(run_dir / "metrics.jsonl"):  # nothing was learned yet: it is the task, or its arguments
-            fail(f"{args.env_id}: {describe(error)}")
-        if isinstance(error, (RunError, OSError)):
-            print(f"{SCRIPT.name}: {describe(error)}", file=sys.stderr)
+        code, is_expected = 1, isinstance(error, RunError) or isinstance(error, OSError) and is_from_packages(error)
+        if is_expected and not os.path.exists(run_dir / "metrics.jsonl"):  # nothing was learned yet: bad input
+            fail(str(error))
+        if is_expected:
+            print(f"{SCRIPT.name}: {error}", file=sys.stderr)
         else:
             traceback.print_exc()
     finally:
+        for s, handler in handlers.items():
+            signal.signal(s, handler)
         for process in mp.active_children():
             process.kill()
             process.join()
     if args.evaluate or RANK > 0:
         return code
+    command = f"{'uv run' if 'UV_RUN_RECURSION_DEPTH' in os.environ else 'python'} {sys.argv[0]}"
     if code == 0 and (run_dir / "best.pt").exists():
         print(f"learning curve, videos and metrics are in {run_dir}; to evaluate the best policy on other episodes:")
-        print(f"    python {sys.argv[0]} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
+        print(f"    {command} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
     elif (run_dir / "last.pt").exists():
-        print(f"{run_dir / 'last.pt'} is safe; to go on: python {sys.argv[0]} --resume {run_dir}", file=sys.stderr)
+        print(f"{run_dir / 'last.pt'} is safe; to go on: {command} --resume {run_dir}", file=sys.stderr)
     return code
 
 
 if __name__ == "__main__":
+    if hasattr(signal, "SIGPIPE") and {"-h", "--help"} & set(sys.argv):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for --help | head
     sys.exit(main(sys.argv[1:]))

@@ -6,7 +6,7 @@ import torch
 from gymnasium.vector.utils import batch_space
 
 import ppo_rgb
-from ppo import ManiSkillVectorEnv  # ppo before mani_skill: it makes tasks build on machines without Vulkan
+from ppo import ManiSkillVectorEnv
 
 
 class BatchedReach(gym.Env):

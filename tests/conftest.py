@@ -7,6 +7,7 @@ import contextlib
 import fcntl
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,8 +21,11 @@ import pytest
 import torch
 
 import ppo
+import ppo_rgb
 
 ROOT = Path(__file__).parent.parent
+for script in (ppo, ppo_rgb):  # in one process, each of them wraps functions that the other has wrapped
+    script.PACKAGES += (ppo.__file__, ppo_rgb.__file__)
 NO_VULKAN = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"}
 
 
@@ -117,7 +121,7 @@ def small():
 @pytest.fixture
 def train(in_tmp, monkeypatch, device, script, small):
     """A function that trains in this process on the torch-native environments, with the given flags. Its runs are named
-    run1, run2, … It returns the metrics, the last checkpoint and the exit code."""
+    run1, run2, … It returns the metrics and the last checkpoint."""
     monkeypatch.setattr(script, "make_envs", partial(batched_env.make_envs, device=device))
     monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # plotting takes longer than these runs
     count = 0
@@ -129,9 +133,9 @@ def train(in_tmp, monkeypatch, device, script, small):
             flags["resume"] = str(script.find_checkpoint(flags["resume"]))
         args = replace(small, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
         with contextlib.ExitStack() as closing:
-            code = script.train(args, closing)
+            script.train(args, closing)
         folder = script.find_run_dir(args)
-        return read_metrics(folder), script.load_checkpoint(folder / "last.pt"), code
+        return read_metrics(folder), script.load_checkpoint(folder / "last.pt")
 
     return run
 
@@ -140,7 +144,7 @@ def same_weights(a, b):
     return all(torch.equal(a["agent"][k], b["agent"][k]) for k in a["agent"])
 
 
-WALL_CLOCK = {"time", "sps", "rollout_time", "update_time", "memory_mb", "actors_memory_mb", "gpu_memory_mb"}
+WALL_CLOCK = {"time", "sps", "rollout_time", "update_time"}
 
 
 def without_clock(rows):
@@ -195,18 +199,26 @@ def crash():
     raise Stop
 
 
+@pytest.fixture
+def signals(script):
+    """Signals stop a run as they do in `main`."""
+    handlers = {s: signal.signal(s, script.stop) for s in script.STOP_SIGNALS}
+    yield
+    for s, handler in handlers.items():
+        signal.signal(s, handler)
+
+
 def refused(arguments, capsys, script=ppo):
-    """Run the script with bad arguments; returns its line of error. The script must exit with 2 and write nothing."""
+    """Run the script with bad arguments; returns what it prints as an error: one line, or tyro's box around the flag
+    that it cannot parse. The script must exit with 2 and write nothing."""
     before = sorted(Path().rglob("*"))
     with pytest.raises(SystemExit) as exit:
         script.main([*map(str, arguments)])
     output = capsys.readouterr()
     assert exit.value.code == 2, arguments
-    assert (
-        output.err.count("\n") == 1
-        and output.err.startswith(f"{script.SCRIPT.name}: ")
-        and "Traceback" not in output.err
-    )
+    is_one_line = output.err.count("\n") == 1 and output.err.startswith(f"{script.SCRIPT.name}: ")
+    assert is_one_line or f"{script.SCRIPT.name} --help" in output.err, output.err
+    assert "Traceback" not in output.err
     assert sorted(Path().rglob("*")) == before, "nothing is written"
     return output.err
 

@@ -34,7 +34,8 @@ def attempt(**flags):
         ppo.make_envs = batched_env.make_envs
         code = 1
         with contextlib.suppress(SystemExit), contextlib.ExitStack() as closing:
-            code = ppo.train(ppo.Args(**ARGS, **flags), closing)
+            ppo.train(ppo.Args(**ARGS, **flags), closing)
+            code = 0
         os._exit(code)
     return pid
 

@@ -7,6 +7,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import torch
 from conftest import NO_VULKAN, ROOT
 
 import ppo_rgb
@@ -58,9 +59,12 @@ def test_shared_memory(monkeypatch, capsys):
         output = capsys.readouterr().out
         assert output.startswith(expected) and ("-> --shm-size" in output) == expected.startswith("missing")
     free(64)
-    ppo_rgb.check_shared_memory(32 * 50 * 102 * 102 * 3 + 16 * 2**20)
+    obs_space = lambda size: ppo_rgb.gym.spaces.Dict(rgb=ppo_rgb.gym.spaces.Box(0, 255, (size, size, 3), "uint8"))
+    action_space, cpu = ppo_rgb.gym.spaces.Box(-1, 1, (8,)), torch.device("cpu")
+    args = ppo_rgb.Args(num_envs=64, num_steps=25, num_actors=2)
+    assert ppo_rgb.make_storage(obs_space(102), action_space, args, cpu, cpu)["obs"]["rgb"].shape[:2] == (25, 64)
     with pytest.raises(SystemExit):
-        ppo_rgb.check_shared_memory(32 * 50 * 103 * 103 * 3 + 16 * 2**20)
+        ppo_rgb.make_storage(obs_space(120), action_space, args, cpu, cpu)
 
 
 def test_where_all_is_broken(tmp_path):

@@ -177,6 +177,11 @@ FAULTS = {
         "self.first_distance = self.distance()[env_idx]",
         r"self.first_distance has 2 rows .* keeps num_envs rows: allocate it in _load_scene",
     ),
+    "mean over environments": (
+        '        reward[info["success"]] = 3\n',
+        "        reward = reward.mean() + 0 * reward\n",
+        "the reward of an environment depends on the actions of the others",
+    ),
     "unseeded numpy": (
         "self._batched_episode_rng[env_idx].uniform(size=5)",
         "np.random.default_rng().uniform(size=(b, 5))",
@@ -205,8 +210,8 @@ def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
         registry.pop("Broken-v1", None)
     env = make("spoiled:Broken-v1", num_envs=NUM_ENVS)
     with pytest.raises(AssertionError, match=message):
-        for check in ("check_seeds", "check_everything_is_initialised", "check_partial_reset", "check_company"):
-            getattr(test_task, check)(env)
+        for name in ("seeds", "everything_is_initialised", "partial_reset", "company", "neighbours"):
+            getattr(test_task, f"check_{name}")(env)
         test_task.check_overlap(env, resets=20)
     env.close()
 

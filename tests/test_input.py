@@ -1,6 +1,8 @@
 """Bad input is refused with exit code 2 and one line, and nothing is written. Good input runs."""
 
+import os
 import random
+import subprocess
 import sys
 import threading
 import time
@@ -10,7 +12,7 @@ from pathlib import Path
 import batched_env
 import pytest
 import torch
-from conftest import refused
+from conftest import NO_VULKAN, ROOT, refused, run_script
 
 import ppo
 import ppo_rgb
@@ -53,7 +55,7 @@ import ppo_rgb
         ('--env_kwargs {"max_episode_steps":[1]}', "integer, actually"),
         ("--env_id TwoRobotPickCube-v1 --robot_uids foo", "Agent foo not found"),
         ("--env_id .x:Y", ".x:Y"),
-        ("--env_id broken:Task-v1", "ZeroDivisionError"),
+        ("--env_id half:Task-v1", "SyntaxError: '(' was never closed (half.py, line 1)"),
         ("--robot_uids none", "PushCube-v1: "),
         ("--env_id PickCube-v1 --robot_uids xarm6_robotiq", "download_asset xarm6_robotiq"),
         ("--evaluate", "--checkpoint"),
@@ -75,7 +77,7 @@ import ppo_rgb
 def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
     (in_tmp / "garbage.pt").write_bytes(b"not a checkpoint")
     (in_tmp / "runs/there").mkdir(parents=True)
-    (in_tmp / "broken.py").write_text("1 / 0")
+    (in_tmp / "half.py").write_text("print(")
     monkeypatch.syspath_prepend(in_tmp)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (in_tmp / "runs/there/metrics.jsonl").write_text("{}\n")
@@ -124,6 +126,38 @@ def test_one_process_at_a_time_downloads_physx(script, monkeypatch, tmp_path):
     assert most == [1] * 4
 
 
+MISTAKEN = """
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+@register_env("Mistaken-v1", max_episode_steps=10)
+class Mistaken(PushCubeEnv):
+    def _initialize_episode(self, env_idx, options):
+        self.cube.set_pose(self.nothing)
+"""
+
+
+@pytest.mark.parametrize("code, line", [("1 / 0", "1 / 0"), (MISTAKEN, "self.cube.set_pose(self.nothing)")])
+def test_a_mistake_in_a_task_shows_its_traceback(code, line, tmp_path):
+    """Whether it shows when the module is imported or when the environments are built. Nothing is written."""
+    (tmp_path / "mistaken.py").write_text(code)
+    flags = "--env_id mistaken:Mistaken-v1 --no-cuda --num_envs 2 --num_actors 1 --num_eval_envs 1"
+    environment = {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    process = run_script(*flags.split(), cwd=tmp_path, env=environment)
+    assert process.returncode == 1 and line in process.stderr and "mistaken.py" in process.stderr
+    assert process.stderr.count("Traceback") == 1 and [path.name for path in tmp_path.iterdir()] == ["mistaken.py"]
+
+
+@pytest.mark.parametrize("first", ["mani_skill.envs", "ppo", "ppo_rgb"])
+def test_scripts_and_maniskill_are_imported_in_any_order_without_vulkan(first, tmp_path):
+    code = f"import {first}, mani_skill.envs, ppo, ppo_rgb; env = ppo.gym.make('PushCube-v1', num_envs=2, "
+    code += "sim_backend='physx_cpu', render_backend='none'); print(ppo.RENDER_DEVICE, env.reset(seed=0)[0].shape)"
+    environment = {**os.environ, **NO_VULKAN, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert process.stdout.startswith("None torch.Size([2, "), process.stderr
+
+
 @pytest.mark.parametrize("script", [ppo, ppo_rgb])
 def test_ray_tracing_of_a_batch_is_refused(script, in_tmp, capsys):
     line = refused(["--sim_backend", "physx_cuda", "--shader", "rt-fast"], capsys, script)
@@ -131,7 +165,7 @@ def test_ray_tracing_of_a_batch_is_refused(script, in_tmp, capsys):
 
 
 def test_driver_too_old(in_tmp, capsys, monkeypatch):
-    """With physx_cuda, the script refuses to run and prints the reason. Otherwise it learns on the CPU."""
+    """With physx_cuda, the script refuses to run and prints the reason. Else it prints it, and learns on the CPU."""
 
     def zeros(*args, device=None, **kwargs):
         raise RuntimeError("The NVIDIA driver on your system is too old (found version 11000).\nPlease update.")
@@ -143,7 +177,8 @@ def test_driver_too_old(in_tmp, capsys, monkeypatch):
     monkeypatch.setattr(Path, "exists", lambda path: path == Path("/proc/driver/nvidia") or exists(path))
     args = ppo.parse_args([])
     ppo.check_simulation(args)
-    assert not args.cuda and "the GPU is not used: The NVIDIA driver" in capsys.readouterr().out
+    assert "the GPU is not used: The NVIDIA driver" in capsys.readouterr().out
+    assert ppo.choose_device(args).type == "cpu"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +192,7 @@ def test_driver_too_old(in_tmp, capsys, monkeypatch):
 def test_note_on_gamma(arguments, note, capsys):
     args = ppo.parse_args(["--no-cuda", "--num_envs", "1", *arguments.split()])
     envs = ppo.make_envs(args, 1, 0)
-    ppo.check_task(args, envs, True)
+    ppo.check_task(args, envs)
     envs.close()
     output = capsys.readouterr().out
     assert output.count("note:") == (note is not None) and (note or "") in output

@@ -49,8 +49,8 @@ def one_step(script, rows, rank, world_size):
     share = slice(rank * rows // world_size, (rank + 1) * rows // world_size)
     batch = [x[share] for x in (actions, logprobs, advantages, returns, values)]
     obs = {k: v[share] for k, v in obs.items()} if script is ppo_rgb else obs[share]
-    metrics = script.average(script.update_minibatch(agent, optimizer, args, obs, *batch))
-    agent.update_normalization(obs["state"] if script is ppo_rgb else obs)
+    metrics = script.all_reduce_mean(script.update_minibatch(agent, optimizer, args, obs, *batch))
+    agent.update_normalization(obs)
     return {**agent.state_dict(), "metrics": metrics}
 
 
@@ -105,9 +105,9 @@ def test_stopped_resumed_and_killed(tmp_path):
     wait_for(lambda: last_step(folder) > 1000 or process.poll() is not None)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=60)
-    assert output.count("stopping after this iteration") == 2 and "last.pt is safe" in output, output
+    assert "stopped by SIGTERM" in output and "last.pt is safe" in output, output
     stopped_at = ppo.load_checkpoint(folder / "last.pt")["global_step"]
-    assert stopped_at == last_step(folder)
+    assert last_step(folder) - stopped_at in (0, 320), "the state at the beginning of the iteration"
 
     process = launch(tmp_path, "--resume", folder, "--checkpoint_freq", 1)
     wait_for(lambda: last_step(folder) > stopped_at + 1000 or process.poll() is not None)

@@ -274,10 +274,9 @@ def test_all_options_train(train):
         dict(encoder="impala", include_state=False, channels_last=False),
         dict(obs_mode="depth", amp=True),
     ):
-        metrics, checkpoint, _ = train(total_timesteps=320, **flags)
+        metrics, checkpoint = train(total_timesteps=320, **flags)
         assert [row["global_step"] for row in metrics if row["kind"] == "eval"] == [0, 320]
         assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
-        assert not any(row.get("update_skipped") for row in metrics)
 
 
 @pytest.mark.slow
@@ -288,7 +287,7 @@ def test_learns_from_images(train):
     episodes, another number of threads, and so other rounding, changes the success rate by 0.1. Training's rate is
     over hundreds of episodes."""
     flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
-    metrics, *_ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
+    metrics, _ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
     assert first["success_once"] < 0.1 and last["success_once"] >= 0.4
     early, late = [
@@ -308,7 +307,7 @@ def test_exact_resume_is_bit_identical(train, in_update, in_tmp):
     assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
 
 
-def test_non_finite_state_skips_one_update(train, monkeypatch, capsys):
+def test_a_state_that_is_not_finite_ends_the_run(train, monkeypatch):
     observe, count = batched_env.BatchedReachImages.observe, 0
 
     def broken(self):
@@ -320,10 +319,8 @@ def test_non_finite_state_skips_one_update(train, monkeypatch, capsys):
         return obs
 
     monkeypatch.setattr(batched_env.BatchedReachImages, "observe", broken)
-    metrics, checkpoint, _ = train()
-    assert sum(row.get("update_skipped", 0) for row in metrics) == 1
-    assert "non-finite observation or reward in environments [3]" in capsys.readouterr().out
-    assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
+    with pytest.raises(ppo_rgb.RunError, match=r"NaN or infinity in environments \[3\]"):
+        train()
 
 
 MEASURE = """
@@ -376,7 +373,7 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
     flags = (*TINY, "--exp-name", "tiny", "--obs_mode", "rgb+depth", "--eval_freq", 2)
     assert ppo_rgb.main([*map(str, flags)]) == 0
     output, errors = capfd.readouterr()
-    assert "observations of a rollout: 0.2 MiB" in output and errors == ""
+    assert "writing to runs/tiny" in output and errors == ""
     assert ppo_rgb.main(["--resume", str(run), "--total_timesteps", "60"]) == 0
     rows = read_metrics(run)
     assert [row["global_step"] for row in rows if row["kind"] == "train"] == [20, 40, 60]
@@ -411,7 +408,6 @@ def test_two_actors_train_from_images(tmp_path):
     train, evaluation = [[row for row in rows if row["kind"] == kind] for kind in ("train", "eval")]
     assert [row["global_step"] for row in train] == [60, 120, 180] and all(row["num_episodes"] >= 6 for row in train)
     assert [row["num_episodes"] for row in evaluation] == [4, 4, 4] and evaluation[0]["episode_len"] == 8
-    assert not any(row["update_skipped"] for row in train) and all(row["actors_memory_mb"] > 0 for row in train)
 
 
 def test_without_vulkan_it_says_what_to_install(tmp_path):
@@ -446,7 +442,6 @@ def test_bad_input(arguments, message, in_tmp, capsys, monkeypatch):
         ("--env_id UnitreeG1Stand-v1", "ppo.py"),
         ("--robot_uids panda_wristcam --camera_width 64 "
          '--env_kwargs {"sensor_configs":{"hand_camera":{"width":99}}}', "--camera_width"),
-        ('--env_kwargs {"sensor_configs":[64]}', "PushCube-v1: TypeError"),
         ("--num_steps 10000000 --total_timesteps 1000000000", "try --num_steps 5000000"),
     ],
 )  # fmt: skip

@@ -17,6 +17,10 @@ from conftest import SMALL, box
 
 import ppo
 
+# isort: split
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
 
 class Reach(BatchedReach):
     """BatchedReach with short episodes that end in every way, its own numbers in infos, and uneven action bounds."""
@@ -330,9 +334,9 @@ def actors():
 def noise_of(actor, iteration, seed=TWO.seed, restart=False):
     obs_size = actor.envs.single_observation_space.shape[0]
     storage, actor.args = make_storage(TWO, obs_size, 8), replace(TWO, seed=seed)
-    actor.connect(make_agent(box(obs_size), box(8), TWO), storage)
+    actor.receive(make_agent(box(obs_size), box(8), TWO), storage)
     actor.act = noise_alone
-    actor.rollout(iteration, restart, False)
+    actor.rollout(iteration, is_first=restart)
     actor.args = TWO
     return storage["actions"][:, actor.env_idx.start : actor.env_idx.stop]
 
@@ -344,8 +348,8 @@ def test_an_actor_writes_its_own_columns(actors):
     for actor, own, others in zip(actors, (slice(0, 2), slice(2, 4)), (slice(2, 4), slice(0, 2))):
         for k, v in storage.items():
             v.copy_(empty[k])
-        actor.connect(agent, storage)
-        actor.rollout(0, True, False)
+        actor.receive(agent, storage)
+        actor.rollout(0, is_first=True)
         for name, x in storage.items():
             assert x[:, own].isfinite().all() and x[:, others].isnan().all(), name
 
@@ -389,6 +393,66 @@ def test_episodes_go_on_from_one_iteration_to_the_next(actors):
         assert actor.envs.base_env.elapsed_steps.tolist() == [TWO.num_steps * (number + 1)] * 2
     noise_of(actor, 0, restart=True)
     torch.testing.assert_close(actor.storage["obs"][0], first, rtol=1e-4, atol=1e-4)
+
+
+@register_env("OtherCubes-v1", max_episode_steps=6)
+class OtherCubes(PushCubeEnv):
+    """Each scene has a cube of another size. Many episodes end early."""
+
+    def __init__(self, *args, reconfiguration_freq=0, **kwargs):
+        super().__init__(*args, reconfiguration_freq=reconfiguration_freq, **kwargs)
+
+    def _load_scene(self, options):
+        self.cube_half_size = 0.01 + 0.02 * self._batched_episode_rng[0].uniform()
+        super()._load_scene(options)
+
+    def evaluate(self):
+        return dict(success=torch.rand(self.num_envs) < 0.1)
+
+
+@pytest.mark.parametrize("num_envs, num_actors", [(1, 1), (4, 1), (5, 2)])
+def test_every_training_episode_ends_by_itself(num_envs, num_actors, monkeypatch):
+    """New scenes cut no episode that a rollout has begun, and each of these is counted once."""
+    args = replace(TWO, env_id="OtherCubes-v1", num_envs=num_envs, num_actors=num_actors, num_eval_envs=num_actors)
+    args.num_steps = 4
+    rollout, in_rollout = ppo.rollout, []
+
+    def spy_rollout(*arguments):
+        in_rollout.append(1)
+        result = rollout(*arguments)
+        in_rollout.clear()
+        return result
+
+    monkeypatch.setattr(ppo, "rollout", spy_rollout)
+    for index in range(num_actors):
+        actor = ppo.Actor(args, index)
+        step, reset, size = actor.envs.step, actor.envs.reset, len(actor.env_idx)
+        running, ended, cube_sizes = torch.zeros(size, dtype=torch.bool), [], []
+
+        def spy_step(action, running=running, ended=ended, step=step):
+            running |= bool(in_rollout)
+            result = step(action)
+            done = result[2] | result[3]
+            if done.any():
+                ended.extend(result[4]["final_info"]["episode"]["episode_len"][done & running].tolist())
+            running &= ~done
+            return result
+
+        def spy_reset(seed=None, options=None, running=running, cubes=cube_sizes, reset=reset, envs=actor.envs):
+            assert "env_idx" in (options or {}) or not running.any(), "an episode was cut"
+            result = reset(seed=seed, options=options)
+            cubes.append(envs.base_env.cube_half_size)
+            return result
+
+        actor.envs.step, actor.envs.reset = spy_step, spy_reset
+        spaces, cpu = (actor.envs.single_observation_space, actor.envs.single_action_space), torch.device("cpu")
+        actor.receive(make_agent(*spaces, args), ppo.make_storage(*spaces, args, cpu, cpu))
+        assert actor.rebuild_freq == 15, "ten episodes of six steps, in iterations of four"
+        counts = [actor.rollout(i, i == 0)["num_episodes"].item() for i in range(45)]
+        assert sum(counts) == len(ended) and not running.any()
+        assert len(set(cube_sizes)) == 3, "at the beginning, and after 15 and 30 iterations"
+        assert max(ended) == 6 and min(ended) < 6
+        actor.close()
 
 
 PEG = replace(TWO, env_id="PegInsertionSide-v1")

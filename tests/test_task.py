@@ -187,6 +187,31 @@ def check_company(env):
         )
 
 
+def check_neighbours(env):
+    """What an environment does in an episode does not depend on what the others do."""
+    row, results = 2, []
+    env.action_space.seed(0)
+    shape = env.action_space.shape
+    own = [env.action_space.sample()[row] for _ in range(10)]
+    for company in (1, 2):
+        env.action_space.seed(company)
+        env.reset(seed=seeds(5), options=dict(reconfigure=True))  # PhysX remembers contacts of earlier episodes
+        results.append([])
+        for action in own:
+            actions = env.action_space.sample().reshape(shape)
+            actions[row] = action
+            obs, reward, terminated, truncated, info = env.step(actions)
+            numbers = {k: v for k, v in info.items() if isinstance(v, torch.Tensor) and v.shape == reward.shape}
+            everything = {"observation": obs, "reward": reward, "end": terminated | truncated, **numbers}
+            results[-1].append({k: v[row].double() for k, v in everything.items()})
+    for step, (one, other) in enumerate(zip(*results)):
+        for name in one:
+            assert torch.allclose(one[name], other[name], atol=1e-4, equal_nan=True), (
+                f"the {name} of an environment depends on the actions of the others, {step + 1} steps after the reset: "
+                "do not compute it from the rows of all environments"
+            )
+
+
 def check_everything_is_initialised(env):
     """Nothing is left over from the episode before."""
     env.reset(seed=seeds(5))
@@ -347,6 +372,10 @@ def test_company(envs, env_id):
             check_company(envs)
     else:
         check_company(envs)
+
+
+def test_neighbours(envs):
+    check_neighbours(envs)
 
 
 def test_everything_is_initialised(envs):

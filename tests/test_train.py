@@ -1,16 +1,21 @@
-"""Each step inside `train` follows its definition, checked on records of short runs."""
+"""`train` on torch-native batched environments inside the real ManiSkillVectorEnv, which GPU simulation uses as well.
+
+Each step follows its definition, checked on records of short runs; and the policy learns."""
 
 import contextlib
 import copy
+import json
 import math
 from dataclasses import replace
+from functools import partial
 from unittest.mock import Mock
 
+import batched_env
 import numpy as np
 import pytest
 import torch
 from batched_env import BatchedReach
-from conftest import SMALL, box, read_metrics
+from conftest import ACTIONS, SMALL, box, read_metrics, same_weights
 from test_rollout import gae_of_episodes
 
 import ppo
@@ -73,7 +78,7 @@ class Run:
             result = evaluate(agent, envs, *arguments, **flags)
             if evaluations:
                 result = {k: torch.tensor(v).float() for k, v in evaluations[len(self.evaluations)].items()}
-            self.evaluations.append(dict(arguments=arguments, weights=copied(agent.state_dict()), flags=flags))
+            self.evaluations.append(copied(agent.state_dict()))
             return result
 
         monkeypatch.setattr(ppo, "make_envs", make_envs)
@@ -83,7 +88,7 @@ class Run:
         monkeypatch.setattr(ppo, "plot_learning_curve", lambda run_dir: None)
         monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter", Mock())
         with contextlib.ExitStack() as closing:
-            self.code = ppo.train(copy.copy(args), closing)
+            ppo.train(copy.copy(args), closing)
         self.folder = ppo.find_run_dir(args)
         rows = read_metrics(self.folder)
         self.train_rows = [row for row in rows if row["kind"] == "train"]
@@ -215,9 +220,7 @@ def test_normalization_follows_the_update(run):
         for update in iteration["updates"]:
             assert all(torch.equal(update["statistics"][k], statistics[k]) for k in statistics)
         seen.append(iteration["storage"]["obs"].flatten(0, 1).double())
-        later = (
-            record.iterations[number + 1]["before"] if number + 1 < ITERATIONS else record.evaluations[-1]["weights"]
-        )
+        later = record.iterations[number + 1]["before"] if number + 1 < ITERATIONS else record.evaluations[-1]
         data = torch.cat(seen)
         torch.testing.assert_close(later["obs_mean"].double(), data.mean(0), rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(later["obs_var"].double(), data.var(0, correction=0), rtol=1e-4, atol=1e-4)
@@ -254,25 +257,14 @@ def test_each_rollout_acts_with_what_was_learned_before_it(run):
     for number, iteration in enumerate(record.iterations):
         after = weights(iteration["after_updates"])
         assert not torch.equal(weights(iteration["before"]), after)
-        assert torch.equal(weights(record.evaluations[number]["weights"]), weights(iteration["before"]))
+        assert torch.equal(weights(record.evaluations[number]), weights(iteration["before"]))
         if number + 1 < ITERATIONS:
             following = record.iterations[number + 1]
             assert torch.equal(weights(following["before"]), after)
             assert torch.equal(following["first_obs"], iteration["next_obs"]), "episodes must go on"
     last = record.checkpoint("last.pt")
-    assert torch.equal(weights(last["agent"]), after) and torch.equal(weights(record.evaluations[-1]["weights"]), after)
-    assert last["iteration"] == ITERATIONS and last["global_step"] == ARGS.total_timesteps and record.code == 0
-
-
-def test_evaluations(run):
-    """Every evaluation plays the same episodes without exploration. The rows name the steps of the evaluations."""
-    record = run(eval_seed=70, eval_freq=3)
-    assert [row["global_step"] for row in record.eval_rows] == [0, 144, 192], "the final policy is evaluated too"
-    for evaluation in record.evaluations:
-        num_episodes, seed, num_steps, rebuild, separately = evaluation["arguments"]
-        # `separately` is for batches of ManiSkill's own tasks, and this is none
-        assert (num_episodes, seed, num_steps, rebuild, separately) == (3, 70, 5, 0, False)
-        assert not evaluation["flags"]
+    assert torch.equal(weights(last["agent"]), after) and torch.equal(weights(record.evaluations[-1]), after)
+    assert last["iteration"] == ITERATIONS and last["global_step"] == ARGS.total_timesteps
 
 
 def test_training_rows(run):
@@ -310,7 +302,7 @@ def test_the_best_checkpoint(run, scores, best):
     record = run(scripted(*scores))
     checkpoint = record.checkpoint("best.pt")
     assert checkpoint["iteration"] == best and checkpoint["global_step"] == best * NUM_ENVS * NUM_STEPS
-    assert all(torch.equal(v, checkpoint["agent"][k]) for k, v in record.evaluations[best]["weights"].items())
+    assert all(torch.equal(v, checkpoint["agent"][k]) for k, v in record.evaluations[best].items())
     assert checkpoint["best_score"] == [pytest.approx(np.mean(x)) for x in scores[best]]
     assert record.checkpoint("last.pt")["iteration"] == ITERATIONS
 
@@ -324,4 +316,128 @@ def test_without_success_the_return_decides(run):
 def test_stop_at_success(run, rate, last):
     record = run(scripted(*[(x, [0, 0]) for x in ([0, 0], [0, 0], [0, 1], [1, 1], [0, 0])]), stop_at_success=rate)
     assert record.checkpoint("last.pt")["iteration"] == last and len(record.iterations) == last
-    assert len(record.eval_rows) == last + 1 and record.code == 0
+    assert len(record.eval_rows) == last + 1
+
+
+# ----- on the CPU and, if there is one, on a GPU ----------------------------------------------------------------------
+
+
+TEXTBOOK = dict(bootstrap_at_done="truncated", partial_reset=False, norm_obs=True, anneal_lr=True)
+FINITE_HORIZON = dict(finite_horizon_gae=True, shared_features=True, clip_vloss=True, target_kl=None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "flags, seed",
+    [({}, 1), (TEXTBOOK, 2), (FINITE_HORIZON, 3)],
+    ids=["default", "textbook", "finite-horizon"],
+)
+def test_learns(train, flags, seed):
+    size = dict(num_envs=128, total_timesteps=40_000, eval_freq=0)
+    metrics, _ = train(seed=seed, learning_rate=1e-3, update_epochs=8, **size, **flags)
+    first, last = [row for row in metrics if row["kind"] == "eval"]
+    assert first["success_once"] < 0.2
+    assert last["success_once"] >= 0.95 and last["num_episodes"] == 24
+
+
+def test_evaluation_schedule_and_no_effect_on_training(train):
+    """Evaluations run before training, every eval_freq iterations, and after the last one. The weights do not depend on
+    them."""
+    runs = {freq: train(eval_freq=freq, num_eval_episodes=16 + freq) for freq in (0, 1, 3)}
+    steps = {f: [row["global_step"] // 320 for row in m if row["kind"] == "eval"] for f, (m, _) in runs.items()}
+    assert steps == {0: [0, 4], 1: [0, 1, 2, 3, 4], 3: [0, 3, 4]}
+    checkpoints = [checkpoint for _, checkpoint in runs.values()]
+    assert all(same_weights(checkpoints[0], other) for other in checkpoints[1:])
+    assert checkpoints[0]["iteration"] == 4 and checkpoints[0]["global_step"] == 1280
+
+
+def test_same_seed_same_weights_other_seed_others(train):
+    (_, a), (_, b), (_, c) = train(seed=5), train(seed=5), train(seed=6)
+    assert same_weights(a, b) and not same_weights(a, c)
+
+
+def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
+    """Any number of environments plays the same episodes, even if the last round is not full."""
+    torch.manual_seed(0)
+    agent = ppo.Agent(box(4), ACTIONS, SMALL).to(device)
+    agent.actor_mean[-1].weight.data *= 100
+    results = []
+    for num_envs in (1, 5, 16):
+        for separately in (False, True):
+            envs = batched_env.make_envs(SMALL, num_envs, 0, evaluation=True, device=device)
+            results.append(ppo.evaluate(agent, envs, 11, seed=100, num_steps=20, separately=separately))
+    for result in results:
+        assert set(result) == {"return", "episode_len", "success_once", "success_at_end", "fail_once", "fail_at_end"}
+        for key, values in result.items():
+            assert values.shape == (11,)
+            torch.testing.assert_close(values, results[0][key])
+    assert (results[0]["episode_len"] == 20).all()
+
+
+def test_evaluation_with_early_ends(train, device):
+    """With eval_partial_reset, an episode counts up to its first success."""
+    agent = ppo.Agent(box(4), ACTIONS, SMALL).to(device)
+    agent.get_action = lambda obs: ((obs[:, 2:] - obs[:, :2]) / 0.3).clamp(-1, 1)  # straight to the goal
+    envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), 16, 0, evaluation=True, device=device)
+    result = ppo.evaluate(agent, envs, 16, seed=0, num_steps=20)
+    start = envs.base_env.reset(seed=list(range(16)))[0]
+    needed = ((start[:, 2:] - start[:, :2]).abs().amax(1) / 0.3 - 0.34).ceil().clamp(min=1).cpu()
+    assert result["success_at_end"].all() and result["success_once"].all()
+    assert (result["episode_len"] <= 7).all() and ((result["episode_len"] - needed).abs() <= 1).all()
+
+
+def test_separate_learning_rates(train):
+    _, a = train(critic_learning_rate=0.0, total_timesteps=320)
+    _, b = train(total_timesteps=320)
+    ppo.seed_all(SMALL.seed)
+    fresh = ppo.Agent(box(4), ACTIONS, SMALL).state_dict()
+    for key in fresh:
+        critic = key.startswith("critic")
+        fixed = key.startswith(("obs_", "action_"))
+        assert torch.equal(a["agent"][key].cpu(), fresh[key]) == (critic or fixed), key
+        assert torch.equal(b["agent"][key].cpu(), fresh[key]) == fixed, key
+
+
+def test_a_real_task(in_tmp):
+    """A run on a task of ManiSkill, in a batch in this process, counts finished episodes and writes trajectories of its
+    evaluations."""
+    args = ppo.Args(
+        sim_backend="physx_cpu", num_envs=4, num_actors=1, num_steps=15, total_timesteps=120, num_minibatches=4,
+        num_eval_envs=3, num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True, cuda=False,
+        env_kwargs='{"max_episode_steps": 10}',
+    )  # fmt: skip
+    with contextlib.ExitStack() as closing:
+        ppo.train(args, closing)
+    rows = read_metrics(in_tmp / "runs/x")
+    assert [row["num_episodes"] for row in rows] == [5, 4, 8, 5] and rows[-1]["kind"] == "eval"
+    assert all(row["episode_len"] == 10 and math.isfinite(row["return"]) for row in rows)
+    episodes = json.loads((in_tmp / "runs/x/videos/trajectory_0.json").read_text())["episodes"]
+    assert len(episodes) == 12 and all(e["elapsed_steps"] == 10 for e in episodes), (
+        "two evaluations, each of two rounds of three episodes"
+    )
+
+
+@pytest.mark.gpu
+def test_cpu_simulation_feeds_a_gpu_learner(in_tmp, monkeypatch):
+    """A copy of the agent on the CPU acts. The first rollout equals that of a CPU learner, and the second uses the
+    weights that the GPU has learned."""
+    monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
+    rollout, copies = ppo.rollout, []
+
+    def spy(agent, *others):
+        copies.append({k: v.clone() for k, v in agent.state_dict().items()})
+        return rollout(agent, *others)
+
+    monkeypatch.setattr(ppo, "rollout", spy)
+    rows = []
+    for cuda in (False, True):
+        args = replace(SMALL, exp_name=f"cuda{cuda}", cuda=cuda, save_freq=1, num_steps=20, total_timesteps=32 * 20 * 2)
+        with contextlib.ExitStack() as closing:
+            ppo.train(args, closing)
+        rows.append([row for row in read_metrics(in_tmp / f"runs/cuda{cuda}") if row["kind"] == "train"])
+    on_cpu, on_gpu = rows
+    for key in ("return", "num_episodes", "explained_variance"):
+        assert on_gpu[0][key] == pytest.approx(on_cpu[0][key], rel=1e-3), key
+    learned = ppo.load_checkpoint("runs/cudaTrue/iteration_1.pt")
+    assert all(x.device.type == "cpu" for x in copies[-1].values())
+    assert same_weights(learned, {"agent": copies[-1]})

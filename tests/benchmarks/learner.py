@@ -154,7 +154,7 @@ def main():
             steps_alone.append(
                 timed(lambda envs=envs, action=action: [envs.step(action) for _ in range(50)], device) / 50
             )
-        torch.set_num_threads(ppo.num_update_threads())
+        torch.set_num_threads(max(1, int(ppo.num_cores() * ppo.UPDATE_THREADS_PER_CORE)))
         alone = statistics.median(steps_alone)
         minibatches = options.update_epochs * options.num_minibatches
         rows = num_envs * num_steps // options.num_minibatches

@@ -104,14 +104,11 @@ def physics_alone(index, num_actors, checkpoint, barrier, queue):
     actor = ppo.Actor(args, index)
     agent = ppo.Agent(actor.envs.single_observation_space, actor.envs.single_action_space, args)
     agent.load_state_dict(ppo.load_checkpoint(checkpoint)["agent"])
-    shape = (args.num_steps, args.num_envs)
-    storage = {k: torch.zeros(shape) for k in ("logprobs", "rewards", "dones", "values", "next_values")}
-    storage["obs"] = torch.zeros(*shape, *actor.envs.single_observation_space.shape)
-    storage["actions"] = torch.zeros(*shape, *actor.envs.single_action_space.shape)
-    actor.connect(agent, storage)
-    actor.rollout(0, True, False)
+    spaces, cpu = (actor.envs.single_observation_space, actor.envs.single_action_space), torch.device("cpu")
+    actor.receive(agent, ppo.make_storage(*spaces, args, cpu, cpu))
+    actor.rollout(0, is_first=True)
     recorder = Recorder(actor.envs.base_env.scene.px)
-    actor.rollout(1, False, False)
+    actor.rollout(1, is_first=False)
     recorder.px.step = recorder.step
     for _ in range(3):
         barrier.wait()

@@ -61,7 +61,7 @@ def main():
     parser.add_argument("--encoder", default="nature")
     options = parser.parse_args()
 
-    torch.set_num_threads(ppo_rgb.num_update_threads())
+    torch.set_num_threads(max(1, int(ppo_rgb.num_cores() * ppo_rgb.UPDATE_THREADS_PER_CORE)))
     size = (options.size, options.size, 3)
     spaces = (
         gym.spaces.Dict(rgb=gym.spaces.Box(0, 255, size, np.uint8), state=gym.spaces.Box(-9, 9, (32,), np.float32)),
