@@ -121,6 +121,9 @@ gc.freeze()  # ManiSkill collects garbage whenever it builds scenes: exempt what
 
 RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RANK", 0))  # set by torchrun
 WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
+STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
+PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # where they lie
+SCRIPT = Path(__file__)
 
 
 # ----- Flags ----------------------------------------------------------------------------------------------------------
@@ -265,8 +268,6 @@ class Args:
     """keep a numbered checkpoint every so many iterations, too"""
     checkpoint_freq: int = 10
     """write last.pt every so many iterations"""
-    checkpoint_minutes: float = 5
-    """write last.pt also when it is older than this (not with --exact_resume)"""
     resume: Optional[str] = None
     """run folder, or a checkpoint in one, to continue in place; flags that you give replace those of the run"""
     exact_resume: bool = False
@@ -287,10 +288,6 @@ class Args:
     @property
     def batch_size(self) -> int:
         return self.num_envs * self.num_steps
-
-    @property
-    def minibatch_size(self) -> int:
-        return self.batch_size // self.num_minibatches
 
     @property
     def num_iterations(self) -> int:
@@ -315,7 +312,7 @@ FIXED_FLAGS = (
 LIMITS = (  # of numbers, if given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
               "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
-    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale checkpoint_minutes"),
+    (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale"),
     (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq "
               "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
@@ -758,13 +755,13 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
     the files and ends the actors."""
     # --- environments, agent, optimizer; `args` counts what all processes of torchrun have, `local` what this one has
     args, local, device, run_dir = start_processes(args, closing)
-    path = args.resume or args.checkpoint
-    loaded = load_checkpoint(path) if path else {}
+    loaded = load_checkpoint(args.resume or args.checkpoint) if args.resume or args.checkpoint else {}
     resumed = loaded if args.resume else {}
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     torch.set_num_threads(1)  # idle threads would spin on cores that the simulation needs
 
     actors = Actors(local, run_dir / "videos", closing)
+    seed_all(args.seed)  # the same weights, whatever the environments drew
     agent = make_agent(*actors.spaces, args, loaded).to(device)
     optimizer = make_optimizer(agent, args, device)
     if loaded:  # the initial learning rate would wreck a policy whose standard deviation has shrunk
@@ -780,7 +777,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
     def update_epoch():
         """All minibatches of a permutation of the batch; returns their UPDATE_METRICS, a row each."""
         rows = []
-        for mb_inds in permutation.split(local.minibatch_size)[: args.num_minibatches]:
+        for mb_inds in permutation.split(local.batch_size // args.num_minibatches)[: args.num_minibatches]:
             mb = tree_map(lambda x: x[mb_inds], batch)
             rows.append(update_minibatch(agent, optimizer, args, **mb))
         return all_reduce_mean(torch.stack(rows))
@@ -864,20 +861,16 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
 # ----- Evaluation -----------------------------------------------------------------------------------------------------
 @torch.no_grad()
 def evaluate(
-    agent, envs, num_episodes: int, seed: int, num_steps: int, rebuild_freq: int = 0, separately: bool = False,
-    exploring: bool = False, video=None,
-) -> dict[str, torch.Tensor]:  # fmt: skip
-    """Run whole episodes of at most `num_steps` steps with deterministic actions; episode k starts from seed + k.
-
-    Args:
-        rebuild_freq: build new scenes, from the seeds, every so many rounds of all environments (0: never).
-        separately: see start_episodes.
-        exploring: draw random actions, as training does.
-        video: an imageio writer that gets a picture of each step.
+    agent, envs, args: Args, num_episodes: int, seed: int, separately: bool = False, exploring: bool = False, video=None
+) -> dict[str, torch.Tensor]:
+    """Run whole episodes; episode k starts from seed + k. Actions are deterministic, unless `exploring`. `separately`:
+    see start_episodes. `video`: an imageio writer that gets a picture of each step.
 
     Returns return, episode_len, success_once and so on: a float tensor (num_episodes,) each, on the CPU."""
     seed_all(seed)  # for tasks that draw random numbers during an episode
-    rounds = []
+    rounds, num_steps, rebuild_freq = [], evaluation_size(envs, args)[1], args.eval_reconfiguration_freq
+    if rebuild_freq is None:  # in rounds of all environments
+        rebuild_freq = 1 if varies_objects(args.env_id) or args.exact_resume else 0
     for first in range(seed, seed + num_episodes, envs.num_envs):
         seeds = list(range(first, first + envs.num_envs))
         if rebuild_freq and len(rounds) % rebuild_freq == 0:
@@ -948,8 +941,7 @@ def concatenate(parts: list[dict]) -> dict[str, torch.Tensor]:
 
 
 def interval(values: torch.Tensor) -> tuple[float, float]:
-    """95% confidence interval of the mean of `values`: Wilson's score interval of a rate, if all are 0 or 1, else the
-    normal one."""
+    """95% confidence interval of the mean: Wilson's score interval if all values are 0 or 1, else the normal one."""
     n, mean, z = len(values), values.double().mean().item(), 1.96
     if ((values == 0) | (values == 1)).all():
         centre = (mean + z**2 / (2 * n)) / (1 + z**2 / n)
@@ -972,9 +964,9 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> None:
         for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs):
             film.record(agent, f"test_videos/seed_{seed}", seed)
 
-    results = dict(env_id=args.env_id, num_episodes=len(episodes["return"]), eval_seed=args.eval_seed)
-    print(f"{args.env_id} on {args.sim_backend}, {results['num_episodes']} episodes from seed {args.eval_seed} on, "
-          "95% intervals:")  # fmt: skip
+    num_episodes, first = len(episodes["return"]), args.eval_seed
+    results = dict(env_id=args.env_id, num_episodes=num_episodes, eval_seed=first)
+    print(f"{args.env_id} on {args.sim_backend}, {num_episodes} episodes from seed {first} on, 95% intervals:")
     for key, values in episodes.items():
         results[key] = values.mean().item()
         line = f"  {key:<20}{results[key]:8.3f}"
@@ -1007,18 +999,16 @@ class Film:
         """Write <folder>/<name>.mp4, frame by frame. If that fails, the run goes on without videos."""
         if self.is_off:
             return
-        path, rebuild_freq = self.folder / f"{name}.mp4", evaluation_rebuild_freq(self.args)
+        path = self.folder / f"{name}.mp4"
         try:
             if find_render_error(self.args):
                 raise RunError(find_render_error(self.args))
             if self.envs is None:
                 self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
                 self.closing.callback(self.envs.close)
-            num_steps = evaluation_size(self.envs, self.args)[1]
             path.parent.mkdir(parents=True, exist_ok=True)
             with imageio.get_writer(path, fps=self.envs.base_env.control_freq) as video:
-                options = dict(rebuild_freq=rebuild_freq, exploring=exploring, video=video)
-                evaluate(agent, self.envs, self.num_envs, seed, num_steps, **options)
+                evaluate(agent, self.envs, self.args, self.num_envs, seed, exploring=exploring, video=video)
         except Exception as error:
             self.is_off = True
             tqdm.write(f"no videos: {describe(error)}")
@@ -1058,28 +1048,16 @@ def make_envs(
     env = make_env(args, num_envs, evaluation, film)
     if record:
         env = RecordEpisode(env, save_video=False, save_on_reset=True, source_type="rl", source_desc="PPO", **record)
-    return ManiSkillVectorEnv(
-        env,
-        auto_reset=not evaluation,
-        ignore_terminations=not (args.eval_partial_reset if evaluation else args.partial_reset),
-        record_metrics=True,
-    )
+    ends_early = args.eval_partial_reset if evaluation else args.partial_reset
+    return ManiSkillVectorEnv(env, auto_reset=not evaluation, ignore_terminations=not ends_early, record_metrics=True)
 
 
 def evaluation_size(envs, args: Args) -> tuple[int, int]:
     """Number of evaluation episodes, and of steps in each."""
     limit = find_max_episode_steps_value(envs)
-    num_episodes, num_steps = args.num_eval_episodes, limit or args.num_eval_steps or 1000
     if limit and args.num_eval_steps:
-        num_episodes = args.num_eval_envs * max(1, args.num_eval_steps // limit)
-    return num_episodes, num_steps
-
-
-def evaluation_rebuild_freq(args: Args) -> int:
-    """After how many rounds of episodes an evaluation builds new scenes (0: never)."""
-    if args.eval_reconfiguration_freq is not None:
-        return args.eval_reconfiguration_freq
-    return 1 if varies_objects(args.env_id) or args.exact_resume else 0
+        return args.num_eval_envs * max(1, args.num_eval_steps // limit), limit
+    return args.num_eval_episodes, limit or args.num_eval_steps or 1000
 
 
 def training_rebuild_freq(args: Args, envs: ManiSkillVectorEnv) -> float:
@@ -1106,9 +1084,8 @@ def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     """Refuse partial resets that the task cannot do; print a note if gamma does not suit the length of its episodes."""
     reset_error = find_reset_error(envs)
     if args.partial_reset and reset_error and {"success", "fail"} & envs.reset()[1].keys():
-        raise RunError(f"{args.env_id} cannot reset some of several environments: --num_actors {args.num_envs} gives "
-                       "each its own process; --no-partial_reset resets all together; the task raised "
-                       f"{describe(reset_error)}")  # fmt: skip
+        fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
+             f"resets all together; --num_actors {args.num_envs} gives each its own process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
     if limit and args.gamma < 1 and not limit / 25 <= 1 / (1 - args.gamma) <= 10 * limit:
         print(f"note: --gamma {args.gamma} looks {1 / (1 - args.gamma):.0f} steps ahead, and an episode has {limit}: "
@@ -1177,10 +1154,9 @@ class Array:
 class BatchedPhysx:
     """The interface of SAPIEN's PhysxGpuSystem over one PhysxCpuSystem per environment, with tensors on the CPU.
 
-    ManiSkill simulates a batch through the tensors `cuda_*`: `gpu_apply_*` moves what it wrote into the simulation,
-    `gpu_fetch_*` moves what was simulated into the tensors. Each body has a row in `cuda_rigid_body_data` (position,
-    quaternion, linear and angular velocity: 13 numbers): first the free bodies, then all links. Each articulation has a
-    row in `cuda_articulation_*`, padded to the largest number of joints."""
+    `gpu_apply_*` moves what ManiSkill wrote into the tensors `cuda_*` into the simulation, `gpu_fetch_*` moves what was
+    simulated into the tensors. `cuda_rigid_body_data` has a row for each body, first the free ones, then all links:
+    position, quaternion, linear and angular velocity. `cuda_articulation_*` has a row for each robot, padded."""
 
     __class__ = physx.PhysxGpuSystem  # for isinstance
 
@@ -1236,8 +1212,6 @@ class BatchedPhysx:
             system.step()
         self.contacts, self.is_fetched = None, False
 
-    # --- from the simulation to the tensors ---
-
     def _fetch(self) -> None:
         """Read the state of all scenes, unless nothing has changed since. Of the links, only roots get velocities: few
         tasks ask for others, and `read_velocities` then reads them."""
@@ -1278,8 +1252,6 @@ class BatchedPhysx:
     def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
         for robot, row in zip(self.robots, self.cuda_articulation_link_incoming_joint_forces.data):
             row[: len(robot.links)] = torch.from_numpy(robot.get_link_incoming_joint_forces())
-
-    # --- from the tensors to the simulation ---
 
     def _changed_rows(self, array: Array, rows=slice(None), columns=slice(None)) -> list[int]:
         changed = array.find_changes(rows, columns)[:, 0].unique().tolist()
@@ -1334,8 +1306,6 @@ class BatchedPhysx:
                 body.add_force_at_point(force[:3].numpy(), (body.pose * body.cmass_local_pose).p)
         self.cuda_rigid_body_force.data.zero_()
 
-    # --- contacts ---
-
     def gpu_create_contact_body_impulse_query(self, bodies: list) -> SimpleNamespace:
         """For the net impulse on each of these bodies or, of each pair, on the first body from the second."""
         return SimpleNamespace(bodies=bodies, cuda_impulses=Array(len(bodies), 3))
@@ -1355,13 +1325,11 @@ class BatchedPhysx:
     gpu_create_contact_pair_impulse_query = gpu_create_contact_body_impulse_query
     gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
 
-    # --- what a CPU simulation need not do ---
-
     def get_scene_offset(self, scene) -> list[float]:
         return [0.0, 0.0, 0.0]  # each scene is a world of its own
 
     def _nothing(self) -> None:
-        pass
+        """For what a CPU simulation need not do."""
 
     gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
     gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
@@ -1502,9 +1470,8 @@ class Actor:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
             self.envs = make_envs(args, len(self.env_idx), seed)
             self.rebuild_freq = training_rebuild_freq(args, self.envs)
-        record = None
-        if args.save_trajectory and trajectory_dir:
-            record = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}")
+        trajectory = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}")
+        record = trajectory if args.save_trajectory else None
         seed = args.eval_seed + RANK * args.num_eval_episodes + eval_episodes.start
         self.eval_envs = make_envs(args, max(1, num_eval_envs), seed, evaluation=True, record=record)
         base_env = self.eval_envs.base_env
@@ -1517,25 +1484,19 @@ class Actor:
         self.agent, self.act = agent, agent.get_action_and_value
         self.storage = tree_map(lambda x: x[:, columns], storage)
 
+    @torch.no_grad()
     def rollout(self, iteration: int, is_first: bool) -> dict:
-        """A rollout of this actor's environments; returns the sums that `rollout` returns. All random numbers follow
-        from the seed, the iteration and the actor."""
+        """Returns the sums that `rollout` returns. All its noise follows from the seed, the iteration and the actor."""
         seed_all(self.args.seed, iteration, RANK, self.index)
         if is_first or iteration % self.rebuild_freq == 0:
-            self.start_all_episodes(iteration)
+            seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
+            seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+            self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act)
         if (iteration + 1) % self.rebuild_freq == 0:
             self.finish_all_episodes(sums)
         return sums
 
-    @torch.no_grad()
-    def start_all_episodes(self, iteration: int) -> None:
-        seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
-        seeds = (seeds // 2 + 2**31).tolist()  # evaluation's lie below 2^31
-        options = dict(reconfigure=True) if self.rebuild_freq < math.inf else None
-        self.obs, _ = self.envs.reset(seed=seeds[self.env_idx.start : self.env_idx.stop], options=options)
-
-    @torch.no_grad()
     def finish_all_episodes(self, sums: dict) -> None:
         """Play the running episodes to their ends, so that new scenes cut none. PPO does not learn from these steps."""
         running = self.envs.base_env.elapsed_steps > 0
@@ -1547,11 +1508,10 @@ class Actor:
                 add_episodes(sums, infos["final_info"], ended)
             running = running & ~ended
 
-    def evaluate(self, num_episodes: int, seed: int, num_steps: int) -> dict[str, torch.Tensor]:
+    def evaluate(self, num_episodes: int, seed: int) -> dict[str, torch.Tensor]:
         """This actor's share of the episodes from `seed` on."""
-        episodes = even_share(num_episodes, self.index, self.args.num_actors)
-        first_seed, rebuild_freq = seed + episodes.start, evaluation_rebuild_freq(self.args)
-        return evaluate(self.agent, self.eval_envs, len(episodes), first_seed, num_steps, rebuild_freq, self.separately)
+        share = even_share(num_episodes, self.index, self.args.num_actors)
+        return evaluate(self.agent, self.eval_envs, self.args, len(share), seed + share.start, self.separately)
 
     def close(self) -> None:
         for envs in (self.envs, self.eval_envs):
@@ -1581,9 +1541,8 @@ class Actors:
         # Processes inherit this: they ignore these signals, and the main process ends them.
         handlers = set_stop_handlers(signal.SIG_IGN)
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
-        self.built = [
-            pool.submit(run_in_actor, "build", args, i, trajectory_dir) for i, pool in enumerate(self.pools, 1)
-        ]
+        further = enumerate(self.pools, start=1)
+        self.built = [pool.submit(run_in_actor, "build", args, i, trajectory_dir) for i, pool in further]
         for s, handler in handlers.items():
             signal.signal(s, handler)
         self.args, self.local = args, Actor(args, 0, trajectory_dir)
@@ -1592,7 +1551,7 @@ class Actors:
             check_task(args, self.local.envs)
         envs = self.local.eval_envs
         self.device, self.spaces = envs.device, (envs.single_observation_space, envs.single_action_space)
-        self.num_eval_episodes, self.max_eval_steps = evaluation_size(envs, args)
+        self.num_eval_episodes, _ = evaluation_size(envs, args)
 
     def share_memory(self, agent: nn.Module, device: torch.device) -> dict:
         """Give all actors the agent and, to train, a storage to write into: the tensors themselves, or a copy if the
@@ -1620,14 +1579,9 @@ class Actors:
         except BrokenProcessPool:
             raise RunError("the process of an actor died (killed? out of memory?)") from None
 
-    def refresh(self) -> None:
-        """Let the actors act with what the learner has learned."""
-        if self.agent is not self.learner:
-            self.agent.load_state_dict(self.learner.state_dict())
-
     def rollout(self, iteration: int, is_first: bool) -> list[dict]:
         """Fill the storage; returns sums over the episodes that ended, of each actor."""
-        self.refresh()
+        self.agent.load_state_dict(self.learner.state_dict())  # it may be a copy on another device
         sums_of_actors = self.call("rollout", iteration, is_first)
         for x in tree_leaves(self.storage):
             broken = (~x.isfinite()).nonzero() if x.is_floating_point() else ()
@@ -1639,10 +1593,9 @@ class Actors:
 
     def evaluate(self, seed: int) -> dict[str, torch.Tensor]:
         """The episodes from `seed` on, of all actors and processes: see the function `evaluate`."""
-        self.refresh()
+        self.agent.load_state_dict(self.learner.state_dict())
         seed += RANK * self.num_eval_episodes
-        episodes = concatenate(self.call("evaluate", self.num_eval_episodes, seed, self.max_eval_steps))
-        return concatenate(all_gather(episodes))
+        return concatenate(all_gather(concatenate(self.call("evaluate", self.num_eval_episodes, seed))))
 
     def close(self) -> None:
         has_failed = sys.exc_info()[0] is not None
@@ -1678,13 +1631,9 @@ def make_storage(obs_space, action_space, args: Args, device: torch.device, lear
 
 
 # ----- Checkpoints ----------------------------------------------------------------------------------------------------
-def find_checkpoint(path: str | Path) -> Path:
-    """A run folder stands for its last.pt."""
-    return Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
-
-
 def load_checkpoint(path: str | Path) -> dict:
-    path = find_checkpoint(path)
+    """What `Checkpoints` wrote, and its path. A run folder stands for its last.pt."""
+    path = Path(path) / "last.pt" if Path(path).is_dir() else Path(path)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         if not {"agent", "optimizer", "args", "obs_spaces", "finished"} <= checkpoint.keys():
@@ -1693,22 +1642,17 @@ def load_checkpoint(path: str | Path) -> dict:
         fail(f"there is no checkpoint {path}")
     except Exception as error:
         fail(f"{path} is not a readable checkpoint: {str(error).partition('. ')[0] or 'it is empty'}")
-    return checkpoint
-
-
-def load_weights(agent: nn.Module, checkpoint: dict, path: str | Path) -> None:
-    try:
-        agent.load_state_dict(checkpoint["agent"])
-    except RuntimeError as error:
-        fail(f"{path} is of another network or task: {error}")
+    return checkpoint | dict(path=str(path))
 
 
 def make_agent(obs_space, action_space, args: Args, checkpoint: dict) -> Agent:
-    """An agent with the weights of the checkpoint or, without one, of the seed: the same in all processes."""
-    seed_all(args.seed)  # whatever the environments drew
+    """An agent with random weights or those of the checkpoint, if there is one: the same in all processes."""
     agent = Agent(obs_space, action_space, args)
     if checkpoint:
-        load_weights(agent, checkpoint, args.resume or args.checkpoint)
+        try:
+            agent.load_state_dict(checkpoint["agent"])
+        except RuntimeError as error:
+            fail(f"{checkpoint['path']} is of another network or task: {error}")
     agent.load_state_dict(all_gather(agent.state_dict())[0])  # machines may turn a seed into different weights
     return agent
 
@@ -1723,16 +1667,14 @@ def load_agent(path: str | Path) -> tuple[Agent, Args]:
     spaces = {k: gym.spaces.Box(0, 1, shape, dtype) for k, (shape, dtype) in checkpoint["obs_spaces"].items()}
     obs_space = spaces["obs"] if "obs" in spaces else gym.spaces.Dict(spaces)
     action_space = gym.spaces.Box(weights["action_low"].numpy(), weights["action_high"].numpy())
-    agent = Agent(obs_space, action_space, args)
-    load_weights(agent, checkpoint, path)
-    return agent.eval(), args
+    return make_agent(obs_space, action_space, args, checkpoint).eval(), args
 
 
 class Checkpoints:
     """Writes last.pt, numbered checkpoints and best.pt. Closing it writes last.pt, however the run ends."""
 
     def __init__(self, args: Args, run_dir: Path, resumed: dict, agent, optimizer, obs_space, logger: "Logger"):
-        self.args, self.run_dir, self.logger, self.last_time = args, run_dir, logger, time.monotonic()
+        self.args, self.run_dir, self.logger = args, run_dir, logger
         self.learner = dict(agent=agent, optimizer=optimizer)
         self.run_info = dict(args=asdict(args), world_size=WORLD_SIZE, wandb_id=logger.wandb_id)
         obs_spaces = getattr(obs_space, "spaces", {"obs": obs_space})  # of a dict of images and state, or of a tensor
@@ -1746,10 +1688,8 @@ class Checkpoints:
         state = copy.deepcopy({name: x.state_dict() for name, x in self.learner.items()})
         progress = dict(iteration=iteration, global_step=global_step, finished=False, best_score=self.best_score)
         self.contents = state | progress | self.run_info | dict(metrics_size=self.logger.file.tell())
-        is_old = time.monotonic() - self.last_time > 60 * self.args.checkpoint_minutes and not self.args.exact_resume
-        if iteration % self.args.checkpoint_freq == 0 or is_old:
+        if iteration % self.args.checkpoint_freq == 0:
             self.write("last.pt")
-            self.last_time = time.monotonic()
         if self.args.save_freq and iteration > 0 and iteration % self.args.save_freq == 0:
             self.write(f"iteration_{iteration}.pt")
 
@@ -1782,7 +1722,7 @@ class Logger:
         from torch.utils.tensorboard import SummaryWriter  # slow to import, and the other actors need none
 
         run_dir.mkdir(parents=True, exist_ok=True)
-        self.run_dir, self.wandb_id, self.last_line = run_dir, None, time.monotonic()
+        self.run_dir, self.wandb_run, self.last_line = run_dir, None, time.monotonic()
         self.lock = filelock.FileLock(run_dir / ".lock")
         try:
             self.lock.acquire(timeout=0)
@@ -1800,12 +1740,11 @@ class Logger:
         if args.track and RANK == 0:
             import wandb
 
-            wandb.init(
+            self.wandb_run = wandb.init(
                 project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
                 config=run_info, save_code=True, id=resumed.get("wandb_id"), resume="allow", sync_tensorboard=True,
             )  # fmt: skip
-            self.wandb_id = wandb.run.id
-        global_step = resumed.get("global_step", 0)
+        self.wandb_id, global_step = self.wandb_run and self.wandb_run.id, resumed.get("global_step", 0)
         self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
         self.bar = tqdm(
             total=args.num_iterations * args.batch_size, initial=global_step, dynamic_ncols=True,
@@ -1827,6 +1766,7 @@ class Logger:
             tqdm.write(f"step {global_step:>9,}  evaluation: {', '.join(summary)}")
             if global_step > 0:
                 plot_learning_curve(self.run_dir)
+                gc.collect()  # figures contain reference cycles, which would keep megabytes
             return
         status = ", ".join([f"{metrics['sps']:,.0f} steps/s", *summary])
         self.bar.set_postfix_str(status, refresh=False)
@@ -1838,10 +1778,8 @@ class Logger:
     def close(self) -> None:
         for resource in (self.bar, self.writer, self.file):
             resource.close()
-        if self.wandb_id:
-            import wandb
-
-            wandb.finish(exit_code=int(sys.exc_info()[0] is not None))
+        if self.wandb_run:
+            self.wandb_run.finish(exit_code=int(sys.exc_info()[0] is not None))
         self.lock.release()
 
 
@@ -1859,8 +1797,6 @@ def plot_learning_curve(run_dir: Path) -> None:
         axis.set(title=key, xlabel="environment steps")
         axis.legend()
     figure.savefig(run_dir / "learning_curve.png", dpi=120)
-    del figure, axis
-    gc.collect()  # figures contain reference cycles, which would keep megabytes
 
 
 def average_episodes(sums_of_actors: list[dict]) -> dict:
@@ -1878,9 +1814,8 @@ def average_episodes(sums_of_actors: list[dict]) -> dict:
 class CudaGraph:
     """A function that is launched as one CUDA graph: small networks compute faster than Python launches their kernels.
 
-    The function takes nothing or an observation. It never makes the host wait, and finds the tensors it reads and
-    writes always in the same place. The next call overwrites what it returned. Three calls run it as it is, on another
-    stream, as capturing requires; the next one captures it, and all later calls replay that."""
+    The function takes nothing or an observation, never makes the host wait, and keeps its tensors in place. The next
+    call overwrites what it returned. Three calls warm up on another stream, the fourth captures, all others replay."""
 
     def __init__(self, function, args: Args, device: torch.device):
         self.enabled = args.cudagraphs and device.type == "cuda"
@@ -1977,9 +1912,6 @@ def num_cores() -> int:
 
 
 # ----- Command line ---------------------------------------------------------------------------------------------------
-SCRIPT = Path(__file__)
-
-
 def fail(message: str) -> NoReturn:
     """Refuse bad input: one line, exit code 2."""
     print(f"{SCRIPT.name}: {' '.join(message.split())}", file=sys.stderr)
@@ -1991,8 +1923,7 @@ class RunError(RuntimeError):
 
 
 def parse_args(argv: list[str]) -> Args:
-    """The command line as Args. Defaults depend on the simulation backend; a checkpoint brings its task and network, a
-    run to resume all its flags."""
+    """Defaults depend on the simulation; a checkpoint brings its task and network, a run to resume all its flags."""
     description = f"{__doc__.splitlines()[0]} The defaults are those of this machine."
     parse = partial(tyro.cli, Args, prog=SCRIPT.name, description=description)
     given, default = parse(args=[arg for arg in argv if arg not in ("-h", "--help")]), Args()
@@ -2018,10 +1949,10 @@ def parse_args(argv: list[str]) -> Args:
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     if args.resume is not None:
-        args.resume = str(find_checkpoint(path))
+        args.resume = checkpoint["path"]
         check_resume(args, checkpoint)
     elif path is not None:
-        args.checkpoint = str(find_checkpoint(path))
+        args.checkpoint = checkpoint["path"]
     return args
 
 
@@ -2031,8 +1962,7 @@ def check_resume(args: Args, checkpoint: dict) -> None:
     for k in FIXED_FLAGS:
         if getattr(args, k) != run[k]:
             fail(f"the run has --{k} {run[k]}, not {getattr(args, k)}: start a new run to change that")
-    size = checkpoint["world_size"]
-    if size != WORLD_SIZE:
+    if (size := checkpoint["world_size"]) != WORLD_SIZE:
         fail(f"the run has {size} processes, not {WORLD_SIZE}: torchrun --nproc_per_node={size} ...")
     if args.num_iterations < checkpoint["iteration"]:
         fail(f"--total_timesteps {args.total_timesteps}: the run already has {checkpoint['global_step']} steps")
@@ -2143,10 +2073,6 @@ def check_simulation(args: Args) -> None:
         fail(f"--sim_backend {args.sim_backend} --render_backend {args.render_backend}: {error}")
 
 
-STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
-PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # where they lie
-
-
 def set_stop_handlers(handler) -> dict:
     """Returns the handlers that were set before."""
     return {s: signal.signal(s, handler) for s in STOP_SIGNALS}
@@ -2215,6 +2141,6 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    if hasattr(signal, "SIGPIPE") and {"-h", "--help"} & set(sys.argv):
+    if hasattr(signal, "SIGPIPE") and ("-h" in sys.argv or "--help" in sys.argv):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for --help | head
     sys.exit(main(sys.argv[1:]))

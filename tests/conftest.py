@@ -130,7 +130,7 @@ def train(in_tmp, monkeypatch, device, script, small):
         nonlocal count
         count += "resume" not in flags
         if "resume" in flags:
-            flags["resume"] = str(script.find_checkpoint(flags["resume"]))
+            flags["resume"] = script.load_checkpoint(flags["resume"])["path"]
         args = replace(small, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
         with contextlib.ExitStack() as closing:
             script.train(args, closing)

@@ -278,7 +278,7 @@ def test_task_that_cannot_reset_some_environments(in_tmp, monkeypatch, capsys):
     flags = (*TINY, "--num_envs", 2, "--num_eval_envs", 2, "--env_id", "whole:Whole-v1", "--no-capture_video")
     line = refused((*flags, "--num_actors", 1), capsys)
     assert "Whole-v1 cannot reset some" in line and "--num_actors 2" in line and "--no-partial_reset" in line
-    assert re.search(r"the task raised \w+Error: .* \(.*py, line \d+\)", line), "the reason, and where"
+    assert re.search(r"\(\w+Error: .* \(.*py, line \d+\)\)", line), "the reason, and where"
     for n, remedy in enumerate((("--num_actors", 2), ("--num_actors", 1, "--no-partial_reset"))):
         assert ppo.main([*map(str, (*flags, *remedy, "--exp-name", n))]) == 0
         assert [row["num_episodes"] for row in read_metrics(in_tmp / f"runs/{n}")] == [2, 4, 2]

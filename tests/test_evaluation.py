@@ -40,9 +40,9 @@ def evaluate_with(args, agent, monkeypatch, again=False):
         actor = ppo.Actor(args, index)
         actor.receive(agent, {})
         if again:
-            actor.evaluate(EPISODES, SEED, STEPS)
+            actor.evaluate(EPISODES, SEED)
         monkeypatch.setattr(ppo, "start_episodes", spy)
-        parts.append(actor.evaluate(EPISODES, SEED, STEPS))
+        parts.append(actor.evaluate(EPISODES, SEED))
         monkeypatch.undo()
         actor.close()
         first_obs.append(torch.cat(of_actor)[: len(parts[-1]["return"])])
@@ -119,9 +119,10 @@ class Reach(BatchedReach):
 
 @pytest.mark.parametrize("num_steps", [6, 20])
 @pytest.mark.parametrize("ends_early", [False, True])
-def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
-    """An episode counts up to its end: the time limit, num_steps, or, with eval_partial_reset, success or failure."""
+def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps, monkeypatch):
+    """An episode counts up to its end: the time limit or, with eval_partial_reset, success or failure."""
     args = replace(SMALL, eval_partial_reset=ends_early, norm_obs=True)
+    monkeypatch.setattr(Reach, "max_episode_steps", num_steps)
     agent = make_agent(box(4), Reach(1).single_action_space, args)
     agent.actor_mean[-1].weight.data *= 4
     network, low, high = Network(agent), np.float32([-0.9, -0.5]), np.float32([0.4, 0.8])
@@ -147,7 +148,7 @@ def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
     for num_envs in (1, 7, 64):
         spy = Spy(Reach(num_envs))
         envs = ppo.ManiSkillVectorEnv(spy, auto_reset=False, ignore_terminations=not ends_early, record_metrics=True)
-        metrics = ppo.evaluate(agent, envs, 40, SEED, num_steps)
+        metrics = ppo.evaluate(agent, envs, args, 40, SEED)
         rounds = [wanted["episode_len"][i : i + num_envs] for i in range(0, 40, num_envs)]
         if 40 % num_envs == 0:  # else, further episodes fill the last round
             assert len(spy.steps) == sum(map(max, rounds)), "no steps after the last episode has ended"
@@ -160,7 +161,9 @@ def test_metrics_equal_those_of_a_plain_loop(ends_early, num_steps):
 def test_exploring_takes_random_actions_and_all_else_does_not():
     agent = make_agent(box(4), Reach(1).single_action_space, SMALL)
     envs = ppo.ManiSkillVectorEnv(Reach(3), auto_reset=False, ignore_terminations=True, record_metrics=True)
-    plain, again, exploring = [ppo.evaluate(agent, envs, 3, 5, 9, exploring=e)["return"] for e in (False, False, True)]
+    plain, again, exploring = [
+        ppo.evaluate(agent, envs, SMALL, 3, 5, exploring=e)["return"] for e in (False, False, True)
+    ]
     assert torch.equal(plain, again) and not torch.isclose(plain, exploring).any()
 
 
@@ -187,7 +190,7 @@ def test_each_actor_has_its_part_of_the_episodes(num_episodes, monkeypatch):
         actor = ppo.Actor(args, index)
         actor.receive(make_agent(box(4), Reach(1).single_action_space, SMALL), {})
         wanted += len(ppo.even_share(num_episodes, index, 3))
-        parts.append(actor.evaluate(num_episodes, 100, 3))
+        parts.append(actor.evaluate(num_episodes, 100))
     assert seeds == [*range(100, 100 + num_episodes)]
     assert len(ppo.concatenate(parts)["return"]) == num_episodes
     assert all(math.isfinite(x) for x in ppo.concatenate(parts)["return"])

@@ -172,21 +172,6 @@ def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
     assert read_metrics(in_tmp / "runs/run1") == metrics
 
 
-def test_checkpoint_minutes(train, in_update, in_tmp):
-    """last.pt is written every checkpoint_freq iterations, and also when it is older than checkpoint_minutes."""
-    saved = {}
-
-    def look():
-        saved["iteration"] = ppo.load_checkpoint("runs/run1/last.pt")["iteration"]
-
-    in_update(8, look)
-    train(**RUN)
-    assert saved["iteration"] == 6
-    in_update(8, lambda: saved.update(late=ppo.load_checkpoint("runs/run2/last.pt")["iteration"]))
-    train(**RUN, checkpoint_minutes=1e-9)
-    assert saved["late"] == 8
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("first, second", [("cuda", "cpu"), ("cpu", "cuda")])
 def test_checkpoints_move_between_devices(in_tmp, monkeypatch, first, second):

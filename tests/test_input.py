@@ -206,21 +206,21 @@ VALID = {
     "ent_coef": [0, 0.1], "vf_coef": [0, 2], "max_grad_norm": [1e-3, 100], "target_kl": [None, 0, 0.02],
     "reward_scale": [1e-3, 10], "bootstrap_at_done": ["always", "truncated", "never"], "logstd_init": [-3, 0.5],
     "eval_freq": [0, 1, 2], "num_eval_steps": [None, 1, 100], "eval_seed": [0, 2**30], "stop_at_success": [None, 0, 1],
-    "save_freq": [None, 1], "checkpoint_freq": [1, 3], "checkpoint_minutes": [1e-6, 100], "exp_name": ["x", "a/b c"],
+    "save_freq": [None, 1], "checkpoint_freq": [1, 3], "exp_name": ["x", "a/b c"],
     "reward_mode": [None, "sparse", "dense"], "control_mode": [None, "pd_ee_delta_pose"], "robot_uids": [None, "panda"],
     "env_kwargs": ["{}", '{"max_episode_steps": 30}'], "render_backend": ["none", "cpu", "gpu"],
     "sim_backend": ["cpu", "physx_cpu"], "reconfiguration_freq": [None, 0, 1], "render_mode": ["all", "sensors"],
     "shader": ["minimal"], "wandb_entity": [None, "us"], "total_timesteps": [126, 500],
 }  # fmt: skip
 SWITCHES = [
-    "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "shared_features", "norm_obs", "save_model",
+    "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "norm_obs", "save_model",
     "exact_resume", "partial_reset", "eval_partial_reset", "torch_deterministic", "cudagraphs",
 ]  # fmt: skip
 NUMBERS = ["0", "-1", "1.5.", "nan", "inf", "x", ""]
 INVALID = {
     **{flag: NUMBERS for flag in ("num_envs", "num_eval_envs", "num_actors", "num_steps", "num_minibatches",
                                   "update_epochs", "num_eval_episodes", "learning_rate", "clip_coef", "max_grad_norm",
-                                  "checkpoint_freq", "checkpoint_minutes", "reward_scale")},
+                                  "checkpoint_freq", "reward_scale")},
     **{flag: NUMBERS[1:] for flag in ("seed", "eval_freq", "ent_coef", "vf_coef", "target_kl", "eval_seed")},
     **{flag: [*NUMBERS[1:], "1.1"] for flag in ("gamma", "gae_lambda", "stop_at_success")},
     "logstd_init": ["nan", "inf", "?"], "total_timesteps": ["0", "3", "-5", "1e5x"],

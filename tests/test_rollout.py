@@ -89,7 +89,6 @@ class Network:
     def __init__(self, agent):
         self.parameters = {k: v.detach().double().numpy().copy() for k, v in agent.state_dict().items()}
         self.norm_obs, self.logstd = agent.norm_obs, self.parameters["actor_logstd"]
-        self.shared = "features.0.weight" in self.parameters
 
     def normalize(self, obs):
         mean, var = self.parameters["obs_mean"], self.parameters["obs_var"]
@@ -102,7 +101,7 @@ class Network:
         return x
 
     def layers(self, name):
-        return [*(f"features.{i}" if self.shared else f"{name}.0.{i}" for i in (0, 2, 4)), f"{name}.1"]
+        return [*(f"{name}.0.{i}" for i in (0, 2, 4)), f"{name}.1"]
 
     def mean(self, obs):
         return self.forward(self.normalize(obs), self.layers("actor_mean"))
@@ -237,7 +236,6 @@ ARGS = replace(SMALL, num_envs=12, num_steps=20, gamma=0.9, gae_lambda=0.8, rewa
 def test_equals_replay(rule, partial_reset, norm_obs):
     """Two rollouts in a row equal their replays. The second continues the episodes of the first."""
     args = replace(ARGS, bootstrap_at_done=rule, partial_reset=partial_reset, norm_obs=norm_obs)
-    args.shared_features = norm_obs and partial_reset
     spy = Spy(Reach(args.num_envs))
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=not partial_reset, record_metrics=True)
     agent = make_agent(box(4), spy.get_wrapper_attr("single_action_space"), args)
@@ -487,7 +485,7 @@ def test_evaluation_builds_the_objects_of_its_seeds():
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
     found, step = [], envs.step
     envs.step = lambda action: found.extend(envs.base_env.peg_half_sizes.tolist()) or step(action)
-    ppo.evaluate(agent, envs, 4, 7, 1, ppo.evaluation_rebuild_freq(args), separately=True)
+    ppo.evaluate(agent, envs, args, 4, 7, separately=True)
     single = gym.make(args.env_id, num_envs=1, sim_backend="physx_cpu", render_backend="none", obs_mode="state")
     wanted = []
     for seed in range(7, 11):

@@ -323,7 +323,7 @@ def test_stop_at_success(run, rate, last):
 
 
 TEXTBOOK = dict(bootstrap_at_done="truncated", partial_reset=False, norm_obs=True, anneal_lr=True)
-FINITE_HORIZON = dict(finite_horizon_gae=True, shared_features=True, clip_vloss=True, target_kl=None)
+FINITE_HORIZON = dict(finite_horizon_gae=True, clip_vloss=True, target_kl=None)
 
 
 @pytest.mark.slow
@@ -365,7 +365,7 @@ def test_evaluation_seeds_are_episodes_and_not_environments(train, device):
     for num_envs in (1, 5, 16):
         for separately in (False, True):
             envs = batched_env.make_envs(SMALL, num_envs, 0, evaluation=True, device=device)
-            results.append(ppo.evaluate(agent, envs, 11, seed=100, num_steps=20, separately=separately))
+            results.append(ppo.evaluate(agent, envs, SMALL, 11, seed=100, separately=separately))
     for result in results:
         assert set(result) == {"return", "episode_len", "success_once", "success_at_end", "fail_once", "fail_at_end"}
         for key, values in result.items():
@@ -379,7 +379,7 @@ def test_evaluation_with_early_ends(train, device):
     agent = ppo.Agent(box(4), ACTIONS, SMALL).to(device)
     agent.get_action = lambda obs: ((obs[:, 2:] - obs[:, :2]) / 0.3).clamp(-1, 1)  # straight to the goal
     envs = batched_env.make_envs(replace(SMALL, eval_partial_reset=True), 16, 0, evaluation=True, device=device)
-    result = ppo.evaluate(agent, envs, 16, seed=0, num_steps=20)
+    result = ppo.evaluate(agent, envs, SMALL, 16, seed=0)
     start = envs.base_env.reset(seed=list(range(16)))[0]
     needed = ((start[:, 2:] - start[:, :2]).abs().amax(1) / 0.3 - 0.34).ceil().clamp(min=1).cpu()
     assert result["success_at_end"].all() and result["success_once"].all()

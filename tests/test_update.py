@@ -42,11 +42,9 @@ def reference_loss(args, agent, b):
     x = b["obs"]
     if args.norm_obs:
         x = ((x - agent.obs_mean) / (agent.obs_var + 1e-5).sqrt()).clamp(-10, 10)
-    if args.shared_features:
-        x = mlp(agent.features, x)
     actor, critic = agent.actor_mean, agent.critic
-    mean = (x if args.shared_features else mlp(actor[0], x)) @ actor[1].weight.T + actor[1].bias
-    value = ((x if args.shared_features else mlp(critic[0], x)) @ critic[1].weight.T + critic[1].bias)[:, 0]
+    mean = mlp(actor[0], x) @ actor[1].weight.T + actor[1].bias
+    value = (mlp(critic[0], x) @ critic[1].weight.T + critic[1].bias)[:, 0]
     std = agent.actor_logstd.exp()
     logprob = (-0.5 * ((b["actions"] - mean) / std) ** 2 - agent.actor_logstd - 0.5 * np.log(2 * np.pi)).sum(1)
     ratio = (logprob - b["logprobs"]).exp()
@@ -76,7 +74,7 @@ def reference_loss(args, agent, b):
         {},
         dict(norm_adv=False, ent_coef=0.05),
         dict(clip_vloss=True, vf_coef=2.0, clip_coef=0.1),
-        dict(shared_features=True, max_grad_norm=0.01),
+        dict(max_grad_norm=0.01),
         dict(norm_obs=True),
     ],
 )

@@ -42,7 +42,7 @@ class Variant:
         start = time.perf_counter()
         permutation = torch.randperm(self.args.batch_size, device=others[0].device)
         for i in range(num_minibatches):
-            mb_inds = permutation[i * self.args.minibatch_size : (i + 1) * self.args.minibatch_size]
+            mb_inds = permutation.chunk(self.args.num_minibatches)[i]
             minibatch = [{k: v[mb_inds] for k, v in obs.items()}, *(x[mb_inds] for x in others)]
             ppo_rgb.update_minibatch(self.agent, self.optimizer, self.args, *minibatch)
         if cuda:
@@ -89,7 +89,7 @@ def main():
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {ppo_rgb.num_cores()} cores"
     buffers = sum(v.numel() * v.element_size() for v in obs.values()) / 2**20
     print(f"{name}, torch {torch.__version__}: {options.encoder}, {options.size}x{options.size}, minibatches of "
-          f"{args.minibatch_size}, observations {buffers:,.0f} MiB")  # fmt: skip
+          f"{rows // args.num_minibatches}, observations {buffers:,.0f} MiB")  # fmt: skip
     for repetition in range(options.repetitions + 1):
         for variant in variants if repetition % 2 else variants[::-1]:
             seconds = variant.update(obs, others, min(4, options.num_minibatches))
@@ -98,7 +98,7 @@ def main():
     print(f"{'':36}{'images/s':>10}{'speedup over the first (min, max)':>36}{'peak MiB':>10}")
     for variant in variants:
         ratios = sorted(a / b for a, b in zip(variants[0].seconds, variant.seconds))
-        rate = args.minibatch_size / statistics.median(variant.seconds)
+        rate = rows // args.num_minibatches / statistics.median(variant.seconds)
         spread = f"{statistics.median(ratios):.2f} ({ratios[0]:.2f}, {ratios[-1]:.2f})"
         print(f"{variant.name:36}{rate:10,.0f}{spread:>36}{variant.peak / 2**20:10,.0f}")
 
