@@ -122,7 +122,7 @@ gc.freeze()  # ManiSkill collects garbage whenever it builds scenes: exempt what
 RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RANK", 0))  # set by torchrun
 WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
-PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # where they lie
+PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # their folders
 SCRIPT = Path(__file__)
 
 
@@ -146,7 +146,6 @@ class Args:
     """Weights & Biases entity (team)"""
     wandb_group: str = "PPO"
     """Weights & Biases group"""
-
     # --- Environment ---
     env_id: str = "PushCube-v1"
     """the task: any registered ManiSkill task, or module:EnvId for your own"""
@@ -182,7 +181,6 @@ class Args:
     """shader pack of videos; ray tracing (rt) needs CPU simulation"""
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"enhanced_determinism": true}'"""
-
     # --- PPO ---
     total_timesteps: int = 10_000_000
     """total number of environment steps"""
@@ -223,14 +221,17 @@ class Args:
     reward_scale: float = 1.0
     """factor on the rewards that PPO learns from; logged returns are without it"""
     bootstrap_at_done: Literal["always", "truncated", "never"] = "always"
-    """at which ends of episodes the value of the final observation counts"""
+    """when to bootstrap from the last observation of an episode: at every end, only at time limits, or never"""
     finite_horizon_gae: bool = False
     """average the n-step returns that exist, instead of the infinite sum"""
     norm_obs: bool = False
     """normalise observations by their running mean and variance"""
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
-
+    compile: bool = False
+    """compile the network with torch.compile, which takes a minute"""
+    cudagraphs: bool = True
+    """on a GPU, launch a step of the policy, and an epoch of the update, as one CUDA graph"""
     # --- Evaluation, checkpoints, videos ---
     eval_freq: int = 25
     """evaluate every so many iterations, and always before the first and after the last (0: only then)"""
@@ -243,7 +244,7 @@ class Args:
     stop_at_success: Optional[float] = None
     """end the run when an evaluation's success_once reaches this rate"""
     evaluate: bool = False
-    """only evaluate --checkpoint, with the task, the network and the flags of its run"""
+    """only evaluate --checkpoint, with the task and the network of its run"""
     checkpoint: Optional[str] = None
     """checkpoint to evaluate, or to start training from (with its weights, Adam's moments and learning rates)"""
     save_model: bool = True
@@ -262,12 +263,6 @@ class Args:
     """film the policy as it explores, every so many iterations"""
     save_trajectory: bool = False
     """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor"""
-
-    # --- Speed ---
-    compile: bool = False
-    """compile the network with torch.compile, which takes a minute"""
-    cudagraphs: bool = True
-    """on a GPU, launch a step of the policy, and an epoch of the update, as one CUDA graph"""
 
     @property
     def batch_size(self) -> int:
@@ -302,7 +297,7 @@ LIMITS = (  # of numbers, if given; none may be infinite or not a number
     (-20, 5, "logstd_init"),
 )  # fmt: skip
 
-# best.pt is of the evaluation with the highest first number; if that is equal, the second one decides
+# best.pt has the highest success rate of all evaluations; if two are equal, the higher return decides
 BEST_BY = ("success_once", "return")
 
 
@@ -473,7 +468,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
 
 def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
     """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
-    less than half of it (Rudin et al. 2022, arXiv 2109.11978), between a hundredth and ten times of the initial one."""
+    less than half of it (Rudin et al. 2022, arXiv 2109.11978), within 0.01 to 10 times the initial one."""
     factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
     for group in optimizer.param_groups:
         if group["adapts"]:
@@ -542,9 +537,9 @@ def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
         if "final_observation" in infos:  # some episodes ended: there, obs is the first one of the next episode
             # ManiSkill's rewards are positive at every step: without the final value, an early success would earn less
             # than dawdling. "truncated" is the textbook rule (Pardo et al. 2018, arXiv 1712.00378).
-            counts = {"always": done, "truncated": truncated & ~terminated, "never": torch.zeros_like(done)}
+            bootstraps = {"always": done, "truncated": truncated & ~terminated, "never": torch.zeros_like(done)}
             final_value = agent.get_value(infos["final_observation"])
-            final_values[step] = torch.where(counts[args.bootstrap_at_done], final_value, 0.0)
+            final_values[step] = torch.where(bootstraps[args.bootstrap_at_done], final_value, 0.0)
             add_episodes(sums, infos["final_info"], done)
     following_values = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
     storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following_values))
@@ -569,7 +564,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
         load_optimizer(optimizer, loaded["optimizer"])
 
     # --- buffers: `storage` has tensors (num_steps, num_envs, ...), `batch` views of them (num_steps * num_envs, ...)
-    storage = actors.share_memory(agent, device)
+    storage = actors.distribute(agent, device)
     names = ("obs", "actions", "logprobs", "values")
     batch = tree_map(lambda x: x.flatten(0, 1), {name: storage[name] for name in names})
     batch |= {name: torch.zeros(local.batch_size, device=device) for name in ("advantages", "returns")}
@@ -588,12 +583,12 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
 
     logger = Logger(args, run_dir, device, resumed)
     closing.callback(logger.close)
-    checkpoints = Checkpoints(local, run_dir, resumed, agent, optimizer, actors.spaces[0], logger)
+    checkpoints = Checkpoints(args, run_dir, resumed, agent, optimizer, actors.spaces[0], logger)
     closing.callback(checkpoints.close)
     film = Film(local, run_dir, closing)
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
-        # --- checkpoint: a run that ends in this iteration, for whatever reason, goes on from here ---
+        # --- checkpoint: a run that ends in this iteration, for whatever reason, can be resumed from here ---
         checkpoints.take(iteration, global_step)
 
         # --- evaluate: the untrained policy, every eval_freq iterations, and the final policy ---
@@ -695,6 +690,7 @@ def evaluate(
                 break
         if isinstance(envs._env, RecordEpisode):
             envs._env.flush_trajectory()
+            envs._env._h5_file.flush()
         rounds.append(episodes)
     names = [k for k in (rounds[0] if rounds else {}) if k != "reward"]
     return {k: torch.cat([episodes[k] for episodes in rounds])[:num_episodes].cpu() for k in names}
@@ -758,7 +754,7 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> None:
     _, _, _, folder = start_processes(args, closing)
     actors = Actors(args, folder / "test_videos", closing)
     agent = make_agent(*actors.spaces, args, load_checkpoint(args.checkpoint)).to(actors.device)
-    actors.share_memory(agent, actors.device)
+    actors.distribute(agent, actors.device)
     episodes = actors.evaluate(args.eval_seed)
     film = Film(args, folder, closing)
     if args.capture_video:
@@ -777,7 +773,7 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> None:
             line += f"  [{low:.3f}, {high:.3f}]"
         print(line)
     (folder / "eval.json").write_text(json.dumps(results, indent=2) + "\n")
-    print(f"written: {folder / 'eval.json'}" + (f", {folder / 'test_videos'}" if film.envs else ""))
+    print(f"written: {folder / 'eval.json'}" + ("" if film.envs is None else f", {folder / 'test_videos'}"))
 
 
 def find_render_error(args: Args) -> Optional[str]:
@@ -835,16 +831,17 @@ def make_task(env_id: str, **kwargs) -> gym.Env:
     try:
         return gym.make(env_id, **kwargs)
     except Exception as error:
-        if isinstance(error, RunError) or not is_from_packages(error):
+        cause = error.__cause__ or error  # gym.make raises some errors again
+        if isinstance(error, RunError) or not is_from_packages(cause):
             raise
-        raise RunError(f"{env_id}: {describe(error)}") from None
+        raise RunError(f"{env_id}: {describe(cause)}") from None
 
 
 def make_envs(
     args: Args, num_envs: int, seed: int, evaluation: bool = False, film: bool = False, record: Optional[dict] = None
 ) -> ManiSkillVectorEnv:
-    """Environments with ManiSkill's interface for a batch. Evaluation's do not reset by themselves. In tasks that vary
-    their objects, these follow from the seed. `record`: arguments of RecordEpisode, which writes trajectories."""
+    """Environments with ManiSkill's interface for a batch. Those for evaluation do not reset by themselves. If the task
+    varies its objects, they follow from the seed. `record`: arguments of RecordEpisode, which writes trajectories."""
     sapien_env.BaseEnv.build_seed = seed
     env = make_env(args, num_envs, evaluation, film)
     if record:
@@ -866,13 +863,13 @@ def training_rebuild_freq(args: Args, envs: ManiSkillVectorEnv) -> float:
     limit = find_max_episode_steps_value(envs)
     if args.exact_resume:  # PhysX remembers contacts of earlier episodes
         return args.checkpoint_freq
-    if args.sim_backend == "physx_cpu" and varies_objects(args.env_id) and limit and not args.reconfiguration_freq:
+    if args.sim_backend == "physx_cpu" and varies_objects(args.env_id) and limit and args.reconfiguration_freq is None:
         return math.ceil(10 * limit / args.num_steps)  # other objects after ten episodes of full length
     return math.inf
 
 
 def find_reset_error(envs: ManiSkillVectorEnv) -> Optional[Exception]:
-    """What the task raises if some of several environments are reset, as a few of ManiSkill's tasks do, or None."""
+    """The error that a task raises when some of several environments are reset, as a few of ManiSkill's do, or None."""
     if envs.num_envs > 1:
         try:
             envs.reset(options=dict(env_idx=torch.zeros(1, dtype=torch.long, device=envs.device)))
@@ -889,8 +886,8 @@ def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
              f"resets all together; --num_actors {args.num_envs} gives each its own process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
     if limit and args.gamma < 1 and not limit / 25 <= 1 / (1 - args.gamma) <= 10 * limit:
-        print(f"note: --gamma {args.gamma} looks {1 / (1 - args.gamma):.0f} steps ahead, and an episode has {limit}: "
-              f"try about {1 - 10 / max(limit, 20):.3g}")  # fmt: skip
+        ahead, better = 1 / (1 - args.gamma), 1 - 10 / max(limit, 20)
+        print(f"note: --gamma {args.gamma} looks {ahead:.0f} steps ahead, and an episode has {limit}: try {better:.3g}")
 
 
 def refuse_download(message: str) -> NoReturn:
@@ -971,7 +968,7 @@ class BatchedPhysx:
         self.links = [link for system in self.systems for link in system.articulation_link_components]
         self.robots = [link.articulation for link in self.links if link.is_root]
         self.joints = [robot.active_joints for robot in self.robots]
-        self.driven, self.contacts, self.is_fetched, self.pose_sizes = set(), None, False, None
+        self.driven, self.contacts, self.is_read, self.pose_sizes = set(), None, False, None
         self.row = {body: i for i, body in enumerate(self.free + self.links)}
         self.row |= {robot: i for i, robot in enumerate(self.robots)}
         self.root_rows = torch.tensor([self.row[link] for link in self.links if link.is_root], dtype=torch.long)
@@ -983,9 +980,8 @@ class BatchedPhysx:
             setattr(self, f"cuda_articulation_{name}", Array(num_robots, max_dof))
         self.cuda_articulation_link_incoming_joint_forces = Array(num_robots, max_links, 6)
 
-        # Where the numbers stand in the bytes of pack(): for each free body, then for each articulation of a scene,
-        # quaternion (w first), position, linear and angular velocity; for articulations also position, velocity and
-        # both drive targets of each joint.
+        # Where the numbers are in the bytes of pack(): for each free body, then for each articulation, quaternion (w
+        # first), position, linear and angular velocity; for articulations then each joint's position and velocity.
         free_at, roots_at, end = [], [], 0
         for system in self.systems:
             for _ in system.rigid_dynamic_components:
@@ -1002,7 +998,10 @@ class BatchedPhysx:
         for i, robot in enumerate(self.robots):
             columns = roots_at[i] + 13 + torch.arange(2 * robot.dof)
             self.joint_columns[:, i, : robot.dof] = columns.view(2, robot.dof)
-        self._fetch()
+        self.gpu_fetch_rigid_dynamic_data()
+        self.gpu_fetch_articulation_link_pose()
+        self.gpu_fetch_articulation_qpos()
+        self.gpu_fetch_articulation_qvel()
 
     def step(self) -> None:
         self.gpu_apply_articulation_target_position()
@@ -1011,16 +1010,17 @@ class BatchedPhysx:
             self.robots[i].root.wake_up()  # as in a single environment, where setting a target wakes the robot
         for system in self.systems:
             system.step()
-        self.contacts, self.is_fetched = None, False
+        self.contacts, self.is_read = None, False
 
-    def _fetch(self) -> None:
-        """Read the state of all scenes, unless nothing has changed since. Of the links, only roots get velocities: few
-        tasks ask for others, and `read_velocities` then reads them."""
-        if self.is_fetched:
+    def _read(self) -> None:
+        """Read the state of all scenes, unless nothing has changed since."""
+        if self.is_read:
             return
-        self.is_fetched = True
+        self.is_read = True
         states = [system.pack() for system in self.systems]
         poses = [scene.pack_poses() for scene in self.scenes]  # quaternion and position of each entity
+        self.states = torch.frombuffer(bytearray().join([*states, bytes(4)]), dtype=torch.float32)
+        self.poses = torch.frombuffer(bytearray().join([*poses, bytes(4)]), dtype=torch.float32)
         sizes = [len(x) // 4 for x in poses]
         if sizes != self.pose_sizes:  # lights and cameras, which are entities, may be added at any time
             self.pose_sizes, entity_at = sizes, {}
@@ -1028,17 +1028,26 @@ class BatchedPhysx:
                 entity_at |= {entity: int(start) + 7 * i for i, entity in enumerate(scene.entities)}
             links_at = torch.tensor([entity_at[link.entity] for link in self.links], dtype=torch.long)
             self.link_columns = links_at[:, None] + torch.tensor([4, 5, 6, 0, 1, 2, 3])
-        states = torch.frombuffer(bytearray().join([*states, bytes(4)]), dtype=torch.float32)
-        poses = torch.frombuffer(bytearray().join([*poses, bytes(4)]), dtype=torch.float32)
-        free, links = slice(0, len(self.free)), slice(len(self.free), None)
-        self.cuda_rigid_body_data.fetch(states[self.free_columns], free)
-        self.cuda_rigid_body_data.fetch(poses[self.link_columns], links, slice(0, 7))
-        self.cuda_rigid_body_data.fetch(states[self.root_columns], self.root_rows, slice(7, 13))
-        self.cuda_articulation_qpos.fetch(states[self.joint_columns[0]])
-        self.cuda_articulation_qvel.fetch(states[self.joint_columns[1]])
 
-    gpu_fetch_rigid_dynamic_data = gpu_fetch_articulation_link_pose = gpu_fetch_articulation_link_velocity = _fetch
-    gpu_fetch_articulation_qpos = gpu_fetch_articulation_qvel = _fetch
+    def gpu_fetch_rigid_dynamic_data(self) -> None:
+        self._read()
+        self.cuda_rigid_body_data.fetch(self.states[self.free_columns], slice(0, len(self.free)))
+
+    def gpu_fetch_articulation_link_pose(self) -> None:
+        self._read()
+        self.cuda_rigid_body_data.fetch(self.poses[self.link_columns], slice(len(self.free), None), slice(0, 7))
+
+    def gpu_fetch_articulation_link_velocity(self) -> None:
+        """Fetches the roots' velocities. Few tasks ask for other links: `read_velocities` then reads theirs."""
+        self._read()
+        self.cuda_rigid_body_data.fetch(self.states[self.root_columns], self.root_rows, slice(7, 13))
+
+    def _fetch_joints(self, name: str, row: int) -> None:
+        self._read()
+        getattr(self, f"cuda_articulation_{name}").fetch(self.states[self.joint_columns[row]])
+
+    gpu_fetch_articulation_qpos = partialmethod(_fetch_joints, "qpos", 0)
+    gpu_fetch_articulation_qvel = partialmethod(_fetch_joints, "qvel", 1)
 
     def read_velocities(self, links: list) -> None:
         for link in links:
@@ -1056,7 +1065,7 @@ class BatchedPhysx:
 
     def _changed_rows(self, array: Array, rows=slice(None), columns=slice(None)) -> list[int]:
         changed = array.find_changes(rows, columns)[:, 0].unique().tolist()
-        self.is_fetched &= not changed
+        self.is_read &= not changed
         return changed
 
     def gpu_apply_rigid_dynamic_data(self) -> None:
@@ -1086,19 +1095,16 @@ class BatchedPhysx:
     gpu_apply_articulation_qvel = partialmethod(_apply_joints, "qvel")
     gpu_apply_articulation_qf = partialmethod(_apply_joints, "qf")
 
-    def _apply_targets(self, name: str, set_target) -> None:
+    def _apply_targets(self, name: str, setter: str) -> None:
         array = getattr(self, f"cuda_articulation_{name}")
         changes = array.find_changes().tolist()
         targets = array.data.tolist() if changes else None
         for i, j in changes:
-            set_target(self.joints[i][j], targets[i][j])
+            getattr(self.joints[i][j], setter)(targets[i][j])
             self.driven.add(i)
 
-    def gpu_apply_articulation_target_position(self) -> None:
-        self._apply_targets("target_qpos", physx.PhysxArticulationJoint.set_drive_target)
-
-    def gpu_apply_articulation_target_velocity(self) -> None:
-        self._apply_targets("target_qvel", physx.PhysxArticulationJoint.set_drive_velocity_target)
+    gpu_apply_articulation_target_position = partialmethod(_apply_targets, "target_qpos", "set_drive_target")
+    gpu_apply_articulation_target_velocity = partialmethod(_apply_targets, "target_qvel", "set_drive_velocity_target")
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         """Forces act once, at the centre of mass."""
@@ -1129,9 +1135,7 @@ class BatchedPhysx:
     def get_scene_offset(self, scene) -> list[float]:
         return [0.0, 0.0, 0.0]  # each scene is a world of its own
 
-    def _nothing(self) -> None:
-        """For what a CPU simulation need not do."""
-
+    _nothing = lambda self: None  # for what a CPU simulation need not do
     gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
     gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
 
@@ -1252,13 +1256,13 @@ solve_inverse_kinematics_of_batches()
 # ----- Actors: processes that simulate on a CPU -----------------------------------------------------------------------
 def even_share(total: int, index: int, shares: int) -> range:
     """Which of `total` things belong to one of several equal shares."""
-    return range(total * index // shares, total * (index + 1) // shares)
+    return range(math.ceil(total * index / shares), math.ceil(total * (index + 1) / shares))
 
 
 class Actor:
     """The environments of one process: its share of training, and its share of each evaluation."""
 
-    def __init__(self, args: Args, index: int, trajectory_dir: Optional[Path] = None):
+    def __init__(self, args: Args, index: int, folder: Optional[Path] = None):
         self.args, self.index = args, index
         seed_all(args.seed, RANK, index)  # some tasks draw random numbers while they are built
         self.env_idx = even_share(args.num_envs, index, args.num_actors)
@@ -1271,8 +1275,7 @@ class Actor:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
             self.envs = make_envs(args, len(self.env_idx), seed)
             self.rebuild_freq = training_rebuild_freq(args, self.envs)
-        trajectory = dict(output_dir=str(trajectory_dir), trajectory_name=f"trajectory_{index}")
-        record = trajectory if args.save_trajectory else None
+        record = dict(output_dir=str(folder), trajectory_name=f"trajectory_{index}") if args.save_trajectory else None
         seed = args.eval_seed + RANK * args.num_eval_episodes + eval_episodes.start
         self.eval_envs = make_envs(args, max(1, num_eval_envs), seed, evaluation=True, record=record)
         base_env = self.eval_envs.base_env
@@ -1291,7 +1294,7 @@ class Actor:
         seed_all(self.args.seed, iteration, RANK, self.index)
         if is_first or iteration % self.rebuild_freq == 0:
             seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
-            seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation's lie below 2^31
+            seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation seeds are below
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act)
         if (iteration + 1) % self.rebuild_freq == 0:
@@ -1301,7 +1304,9 @@ class Actor:
     def finish_all_episodes(self, sums: dict) -> None:
         """Play the running episodes to their ends, so that new scenes cut none. PPO does not learn from these steps."""
         running = self.envs.base_env.elapsed_steps > 0
-        while running.any():
+        for _ in range(evaluation_size(self.envs, self.args)[1]):
+            if not running.any():
+                break
             action = self.agent.clip_action(self.act(self.obs)[0])
             self.obs, _, terminated, truncated, infos = self.envs.step(action)
             ended = running & (terminated | truncated)
@@ -1340,21 +1345,20 @@ class Actors:
 
     def __init__(self, args: Args, trajectory_dir: Path, closing: contextlib.ExitStack):
         # Processes inherit this: they ignore these signals, and the main process ends them.
-        handlers = set_stop_handlers(signal.SIG_IGN)
+        handlers = set_handlers(dict.fromkeys(STOP_SIGNALS, signal.SIG_IGN))
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
         further = enumerate(self.pools, start=1)
         self.built = [pool.submit(run_in_actor, "build", args, i, trajectory_dir) for i, pool in further]
-        for s, handler in handlers.items():
-            signal.signal(s, handler)
-        self.args, self.local = args, Actor(args, 0, trajectory_dir)
+        set_handlers(handlers)
+        self.args, self.actor0 = args, Actor(args, 0, trajectory_dir)
         closing.callback(self.close)
         if not args.evaluate:
-            check_task(args, self.local.envs)
-        envs = self.local.eval_envs
+            check_task(args, self.actor0.envs)
+        envs = self.actor0.eval_envs
         self.device, self.spaces = envs.device, (envs.single_observation_space, envs.single_action_space)
         self.num_eval_episodes, _ = evaluation_size(envs, args)
 
-    def share_memory(self, agent: nn.Module, device: torch.device) -> dict:
+    def distribute(self, agent: nn.Module, device: torch.device) -> dict:
         """Give all actors the agent and, to train, a storage to write into: the tensors themselves, or a copy if the
         learner is on another device. Returns the learner's storage: tensors (num_steps, num_envs, ...)."""
         args, has_copies = self.args, self.device.type != device.type
@@ -1362,21 +1366,21 @@ class Actors:
         self.storage = {} if args.evaluate else make_storage(*self.spaces, args, self.device, device)
         self.learner_storage = tree_map(lambda x: x.to(device), self.storage) if has_copies else self.storage
         if self.pools:
-            for x in tree_leaves([dict(self.agent.state_dict()), self.storage]):
+            for x in tree_leaves([self.agent.state_dict(), self.storage]):
                 x.share_memory_()
         self.call("receive", self.agent, self.storage)
         self.built = []
         if args.compile:  # only now: a compiled function cannot be sent to other actors
             for network in {self.learner, self.agent}:  # on one device they are the same
                 network.get_action_and_value = torch.compile(network.get_action_and_value, dynamic=False)
-        self.local.act = CudaGraph(self.agent.get_action_and_value, args, self.device)
+        self.actor0.act = CudaGraph(self.agent.get_action_and_value, args, self.device)
         return self.learner_storage
 
     def call(self, method: str, *arguments) -> list:
         """Call a method of all actors at the same time; returns their results in order."""
         try:
             futures = [pool.submit(run_in_actor, method, *arguments) for pool in self.pools]
-            return [getattr(self.local, method)(*arguments), *(future.result() for future in self.built + futures)]
+            return [getattr(self.actor0, method)(*arguments), *(future.result() for future in self.built + futures)]
         except BrokenProcessPool:
             raise RunError("the process of an actor died (killed? out of memory?)") from None
 
@@ -1384,10 +1388,10 @@ class Actors:
         """Fill the storage; returns sums over the episodes that ended, of each actor."""
         self.agent.load_state_dict(self.learner.state_dict())  # it may be a copy on another device
         sums_of_actors = self.call("rollout", iteration, is_first)
-        for x in tree_leaves(self.storage):
-            broken = (~x.isfinite()).nonzero() if x.is_floating_point() else ()
-            if len(broken):
-                raise RunError(f"the simulation gave NaN or infinity in environments {broken[:, 1].unique().tolist()}")
+        floats = [x for x in tree_leaves(self.storage) if x.is_floating_point()]
+        is_broken = torch.stack([~x.isfinite().reshape(*x.shape[:2], -1).all(2).all(0) for x in floats]).any(0)
+        if any(all_gather(is_broken.any().item())):  # all processes stop together
+            raise RunError(f"the rollout has NaN or infinity in environments {is_broken.nonzero().flatten().tolist()}")
         if self.learner_storage is not self.storage:
             tree_map(lambda new, old: new.copy_(old), self.learner_storage, self.storage)
         return sums_of_actors
@@ -1418,9 +1422,10 @@ def make_storage(obs_space, action_space, args: Args, device: torch.device, lear
     storage["obs"] = tree_map(lambda space: empty(space.shape, space.dtype.name), obs_spaces)
     storage["actions"] = empty(action_space.shape)
 
-    free = {"memory": psutil.virtual_memory().available / LOCAL_WORLD_SIZE}
+    free = {} if device.type == "cuda" else {"memory": psutil.virtual_memory().available / LOCAL_WORLD_SIZE}
     if args.num_actors > 1 and Path("/dev/shm").exists():
-        free["shared memory (docker run --shm-size; --num_actors 1 needs none)"] = shutil.disk_usage("/dev/shm").free
+        size = shutil.disk_usage("/dev/shm").free / LOCAL_WORLD_SIZE
+        free["shared memory (docker run --shm-size; --num_actors 1 needs none)"] = size
     if learner_device.type == "cuda":
         free["the GPU's memory"] = torch.cuda.mem_get_info(learner_device)[0]
     needed = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
@@ -1439,8 +1444,6 @@ def load_checkpoint(path: str | Path) -> dict:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         if not {"agent", "optimizer", "args", "obs_spaces", "finished"} <= checkpoint.keys():
             raise ValueError("it was written by another version of this script")
-    except FileNotFoundError:
-        fail(f"there is no checkpoint {path}")
     except Exception as error:
         fail(f"{path} is not a readable checkpoint: {str(error).partition('. ')[0] or 'it is empty'}")
     return checkpoint | dict(path=str(path))
@@ -1476,7 +1479,7 @@ class Checkpoints:
 
     def __init__(self, args: Args, run_dir: Path, resumed: dict, agent, optimizer, obs_space, logger: "Logger"):
         self.args, self.run_dir, self.logger = args, run_dir, logger
-        self.learner = dict(agent=agent, optimizer=optimizer)
+        self.saved = dict(agent=agent, optimizer=optimizer)
         self.run_info = dict(args=asdict(args), world_size=WORLD_SIZE, wandb_id=logger.wandb_id)
         obs_spaces = getattr(obs_space, "spaces", {"obs": obs_space})  # of a dict of images and state, or of a tensor
         self.run_info["obs_spaces"] = {k: (tuple(x.shape), x.dtype.name) for k, x in obs_spaces.items()}
@@ -1486,7 +1489,8 @@ class Checkpoints:
 
     def take(self, iteration: int, global_step: int) -> None:
         """Copy the state from which a resumed run goes on, and write it if that is due."""
-        state = copy.deepcopy({name: x.state_dict() for name, x in self.learner.items()})
+        state = {name: x.state_dict() for name, x in self.saved.items()}
+        state = tree_map(lambda x: x.to("cpu", copy=True) if isinstance(x, torch.Tensor) else x, state)
         progress = dict(iteration=iteration, global_step=global_step, finished=False, best_score=self.best_score)
         self.contents = state | progress | self.run_info | dict(metrics_size=self.logger.file.tell())
         if iteration % self.args.checkpoint_freq == 0:
@@ -1502,7 +1506,7 @@ class Checkpoints:
 
     def write(self, name: str) -> None:
         """Write another file, then rename it: at any moment there is the old checkpoint or the new one, whole."""
-        if self.args.save_model:
+        if self.args.save_model and RANK == 0:
             with open(self.run_dir / name.replace(".pt", ".tmp"), "wb") as file:
                 torch.save(self.contents, file)
                 file.flush()
@@ -1677,7 +1681,7 @@ def local_args(args: Args) -> Args:
     if args.sim_backend == "physx_cuda":
         local.sim_backend = f"physx_cuda:{LOCAL_RANK}"
     if RANK > 0:  # only the first process writes
-        local.save_model = local.save_trajectory = local.capture_video = local.save_train_video_freq = False
+        local.save_trajectory = local.capture_video = local.save_train_video_freq = False
     return local
 
 
@@ -1738,8 +1742,8 @@ def parse_args(argv: list[str]) -> Args:
     path = given.checkpoint if given.resume is None else given.resume
     if path is not None:
         checkpoint = load_checkpoint(path)
-        run = checkpoint["args"]
-        default = replace(default, **{k: run[k] for k in (FIXED_FLAGS if given.resume is None else run)})
+        run, flags = checkpoint["args"], FIXED_FLAGS if given.resume is None else asdict(default)
+        default = replace(default, **{k: run[k] for k in flags if k in run})
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
@@ -1761,8 +1765,8 @@ def check_resume(args: Args, checkpoint: dict) -> None:
     """Refuse what a resumed run cannot change; print what it changes."""
     run = checkpoint["args"]
     for k in FIXED_FLAGS:
-        if getattr(args, k) != run[k]:
-            fail(f"the run has --{k} {run[k]}, not {getattr(args, k)}: start a new run to change that")
+        if getattr(args, k) != run.get(k):
+            fail(f"the run has --{k} {run.get(k)}, not {getattr(args, k)}: start a new run to change that")
     if (size := checkpoint["world_size"]) != WORLD_SIZE:
         fail(f"the run has {size} processes, not {WORLD_SIZE}: torchrun --nproc_per_node={size} ...")
     if args.num_iterations < checkpoint["iteration"]:
@@ -1770,7 +1774,7 @@ def check_resume(args: Args, checkpoint: dict) -> None:
     if args.num_iterations == checkpoint["iteration"] and checkpoint["finished"]:
         print(f"the run is finished; to go on, give more than --total_timesteps {args.total_timesteps}")
         sys.exit(0)
-    changes = [f"--{k} {v} (was {run[k]})" for k, v in asdict(args).items() if v != run[k] and k != "resume"]
+    changes = [f"--{k} {v} (was {run[k]})" for k, v in asdict(args).items() if v != run.get(k, v) and k != "resume"]
     if changes:
         print(f"changed: {', '.join(changes)}")
 
@@ -1818,7 +1822,7 @@ def check(args: Args) -> None:
         fail("--track needs Weights & Biases: pip install wandb")
     if WORLD_SIZE > 1 and args.evaluate:
         fail("--evaluate is for one process: leave out torchrun")
-    check_task_exists(args)
+    check_task_flags(args)
     check_simulation(args)
     check_observations(args)
     run_dir = find_run_dir(args)
@@ -1826,7 +1830,7 @@ def check(args: Args) -> None:
         fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
 
 
-def check_task_exists(args: Args) -> None:
+def check_task_flags(args: Args) -> None:
     try:
         find_task(args.env_id)
     except KeyError:
@@ -1852,6 +1856,8 @@ def check_simulation(args: Args) -> None:
         fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
     if on_gpu and (args.shader or "").startswith("rt"):
         fail(f"--shader {args.shader}: ray tracing needs CPU simulation: --sim_backend physx_cpu")
+    if on_gpu and args.exact_resume:
+        fail("--exact_resume needs CPU simulation: --sim_backend physx_cpu")
     if WORLD_SIZE > 1 and ":" in args.sim_backend:
         fail(f"--sim_backend {args.sim_backend}: with torchrun each process takes its own GPU: physx_cuda")
     if args.cuda and 0 < torch.cuda.device_count() < LOCAL_WORLD_SIZE:
@@ -1874,14 +1880,13 @@ def check_simulation(args: Args) -> None:
         fail(f"--sim_backend {args.sim_backend} --render_backend {args.render_backend}: {error}")
 
 
-def set_stop_handlers(handler) -> dict:
-    """Returns the handlers that were set before."""
-    return {s: signal.signal(s, handler) for s in STOP_SIGNALS}
+def set_handlers(handlers: dict) -> dict:
+    """Set the handlers of signals; returns those before."""
+    return {s: signal.signal(s, handler) for s, handler in handlers.items()}
 
 
 def stop(signum: int, frame) -> NoReturn:
     """End the run here, with what it had learned when the iteration began."""
-    set_stop_handlers(signal.SIG_IGN)  # torchrun sends a second one
     raise KeyboardInterrupt(signum)
 
 
@@ -1896,8 +1901,7 @@ def describe(error: BaseException) -> str:
     if isinstance(error, (RunError, OSError)):
         return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1]
-    reason = str(error).partition(" was raised from the environment creator")[0]
-    return f"{type(error).__name__}: {reason} ({Path(place.filename).name}, line {place.lineno})"
+    return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
 
 
 def main(argv: list[str]) -> int:
@@ -1906,13 +1910,13 @@ def main(argv: list[str]) -> int:
     args = parse_args(argv)
     check(args)
     run_dir, code = find_run_dir(args), 0
-    handlers = set_stop_handlers(stop)
+    handlers = set_handlers(dict.fromkeys(STOP_SIGNALS, stop))
     try:
         with contextlib.ExitStack() as closing:
             try:
                 (evaluate_checkpoint if args.evaluate else train)(args, closing)
             finally:  # from here on, a signal must not keep last.pt from being written
-                set_stop_handlers(signal.SIG_IGN)
+                set_handlers(dict.fromkeys(STOP_SIGNALS, signal.SIG_IGN))
     except KeyboardInterrupt as interrupt:
         code = 128 + interrupt.args[0]
         print(f"{SCRIPT.name}: stopped by {signal.Signals(interrupt.args[0]).name}", file=sys.stderr)
@@ -1925,8 +1929,7 @@ def main(argv: list[str]) -> int:
         else:
             traceback.print_exc()
     finally:
-        for s, handler in handlers.items():
-            signal.signal(s, handler)
+        set_handlers(handlers)
         for process in mp.active_children():
             process.kill()
             process.join()

@@ -3,8 +3,8 @@
 #
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
-# What those that end in _cpu reach, in how many steps and minutes, stands in tests/benchmarks/README.md. The flags of
-# those that end in _gpu are ManiSkill's own; nobody has measured them here.
+# Results of the _cpu recipes are in tests/benchmarks/README.md. The flags of the _gpu recipes are ManiSkill's own; nobody
+# has measured them here.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -492,6 +492,21 @@ def test_bodies_and_joints_report_their_state(build):
         assert b.links[3].linear_velocity.any() and b.qacc.any() and batch.cube.linear_velocity[1].any()
 
 
+def test_a_fetch_leaves_other_writes_alone(build):
+    """What a task wrote and has not applied yet survives the fetch of something else, as on a GPU."""
+    env = build("PushCube-v1", 2)
+    env.reset(seed=[0, 1])
+    px, wanted = env.scene.px, env.agent.robot.qpos + 0.1
+    env.agent.robot.set_qpos(wanted)
+    env.obj.set_pose(Pose.create_from_pq(torch.tensor([[0.0, 0.1, 0.5]] * 2)))
+    px.gpu_apply_rigid_dynamic_data()
+    px.gpu_fetch_rigid_dynamic_data()
+    torch.testing.assert_close(env.agent.robot.qpos, wanted)
+    px.gpu_apply_articulation_qpos()
+    px.gpu_fetch_articulation_qpos()
+    torch.testing.assert_close(env.agent.robot.qpos, wanted)
+
+
 def test_link_velocities_of_merged_links(build):
     """A merged view of a root and another link has the velocities of both."""
     env = build("PickCube-v1", 2)

@@ -23,6 +23,7 @@ def check_machine(**environment):
     return process.stdout
 
 
+@pytest.mark.slow
 def test_without_vulkan():
     table = check_machine(**NO_VULKAN)
     assert "ok       state, CPU simulation     PushCube-v1 was built and stepped" in table

@@ -54,6 +54,7 @@ def one_step(script, rows, rank, world_size):
     return {**agent.state_dict(), "metrics": metrics}
 
 
+@pytest.mark.slow
 def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
     process = launch(tmp_path, "--total_timesteps", 960, "--exp-name", "x", *FLAGS)
     output, _ = process.communicate(timeout=300)

@@ -393,7 +393,7 @@ def test_episodes_go_on_from_one_iteration_to_the_next(actors):
     torch.testing.assert_close(actor.storage["obs"][0], first, rtol=1e-4, atol=1e-4)
 
 
-@register_env("OtherCubes-v1", max_episode_steps=6)
+@register_env("OtherCubes-v0", max_episode_steps=6)
 class OtherCubes(PushCubeEnv):
     """Each scene has a cube of another size. Many episodes end early."""
 
@@ -411,7 +411,7 @@ class OtherCubes(PushCubeEnv):
 @pytest.mark.parametrize("num_envs, num_actors", [(1, 1), (4, 1), (5, 2)])
 def test_every_training_episode_ends_by_itself(num_envs, num_actors, monkeypatch):
     """New scenes cut no episode that a rollout has begun, and each of these is counted once."""
-    args = replace(TWO, env_id="OtherCubes-v1", num_envs=num_envs, num_actors=num_actors, num_eval_envs=num_actors)
+    args = replace(TWO, env_id="OtherCubes-v0", num_envs=num_envs, num_actors=num_actors, num_eval_envs=num_actors)
     args.num_steps = 4
     rollout, in_rollout = ppo.rollout, []
 
