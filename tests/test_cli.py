@@ -101,11 +101,6 @@ def test_wilson_interval():
     assert ppo.interval(values) == pytest.approx((4.5 - half, 4.5 + half))
 
 
-def test_refusal_as_a_command(tmp_path):
-    process = run_script("--env_id", "PickCub-v1", cwd=tmp_path)
-    assert process.returncode == 2 and "PickCube-v1" in process.stderr and process.stderr.count("\n") == 1
-
-
 def test_commands_for_the_peers_scripts_parse(trained):
     """Flags parse as ManiSkill's ppo.py and ppo_fast.py and CleanRL's scripts spell them."""
     args = ppo.parse_args(
@@ -160,12 +155,14 @@ def test_the_gpu_that_simulates_is_torchs_current_device(monkeypatch):
     assert devices == [device] == [torch.device("cuda:1")]
 
 
-def test_help_shows_every_flag_with_this_machines_defaults(tmp_path):
-    process = run_script("--help", cwd=tmp_path)
-    assert process.returncode == 0
+def test_help_shows_every_flag_with_this_machines_defaults(capsys):
+    with pytest.raises(SystemExit) as error:
+        ppo.parse_args(["--help"])
+    output = capsys.readouterr().out
+    assert error.value.code == 0
     for field in ppo.Args.__dataclass_fields__:
-        assert "--" + field.replace("_", "-") in process.stdout or "--" + field in process.stdout
-    assert f"{ppo.parse_args([]).num_envs}" in process.stdout
+        assert "--" + field.replace("_", "-") in output or "--" + field in output
+    assert f"{ppo.parse_args([]).num_envs}" in output
 
 
 def test_flags_are_spelled_with_hyphens_or_underscores():
@@ -182,36 +179,9 @@ def test_help_may_be_cut_off(tmp_path):
     assert process.stdout.count("\n") == 3 and process.stderr == ""
 
 
-def test_without_vulkan_trains_and_says_why_there_is_no_video(tmp_path):
-    process = run_script(*TINY, cwd=tmp_path, env=NO_VULKAN)
-    assert process.returncode == 0, process.stderr
-    assert process.stdout.count("no videos: there is no Vulkan") == 1 and "mesa-vulkan-drivers" in process.stdout
-    assert process.stderr == "" and (tmp_path / "runs/tiny/best.pt").exists()
-    assert not (tmp_path / "runs/tiny/videos").exists()
-
-
 @pytest.mark.slow
-def test_other_kinds_of_task(tmp_path):
-    """Tasks with Dict action spaces, without success, with other robots or with sparse reward train without Vulkan."""
-    env_ids = ("TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1")
-    flags = [*map(str, TINY), "--num_envs", "2", "--num_actors", "1", "--env_kwargs", '{"max_episode_steps": 10}']
-    (tmp_path / "all.py").write_text(f"""
-import sys
-sys.path.insert(0, {str(ROOT)!r})
-import ppo
-if __name__ == "__main__":
-    assert not any(ppo.main([*{flags!r}, "--env_id", x, "--exp_name", x]) for x in {env_ids!r})
-""")
-    process = run_script(cwd=tmp_path, env=NO_VULKAN, script=tmp_path / "all.py")
-    assert process.returncode == 0, process.stderr
-    for env_id in env_ids:
-        rows = read_metrics(tmp_path / "runs" / env_id)
-        assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
-        assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
-
-
-@pytest.mark.slow
-def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
+def test_terminal_without_vulkan_shows_one_bar_and_lines_that_stay(tmp_path):
+    """One of the lines says why there is no video, and how to get a renderer."""
     import fcntl
     import pty
     import struct
@@ -236,6 +206,8 @@ def test_terminal_shows_one_bar_and_lines_that_stay(tmp_path):
         except OSError:  # the other end is closed
             break
     assert process.wait() == 0
+    assert output.count(b"no videos: there is no Vulkan") == 1 and b"mesa-vulkan-drivers" in output
+    assert (tmp_path / "runs/tiny/best.pt").exists() and not (tmp_path / "runs/tiny/videos").exists()
     text = re.sub(r"\x1b\[[0-9;]*[A-Za-z]", "", output.decode()).replace("\r\n", "\n")
     # what stays on a line is what came after the last carriage return
     staying = [line.rpartition("\r")[2] for line in text.split("\n") if line.rpartition("\r")[2].strip()]
