@@ -3,11 +3,13 @@
 A spy between ManiSkillVectorEnv and the task records the inputs and outputs of the simulation. From these alone the
 replay computes what the storage must hold: it shares no code with ppo.py."""
 
+import contextlib
 import copy
 import math
 from collections import Counter
 from dataclasses import replace
 
+import batched_env
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -451,6 +453,21 @@ def test_every_training_episode_ends_by_itself(num_envs, num_actors, monkeypatch
         assert len(set(cube_sizes)) == 3, "at the beginning, and after 15 and 30 iterations"
         assert max(ended) == 6 and min(ended) < 6
         actor.close()
+
+
+def test_a_copy_of_the_agent_acts_with_what_was_learned(tmp_path, monkeypatch):
+    """A learner on a GPU has such a copy for its CPU simulation."""
+    monkeypatch.setattr(ppo, "make_envs", batched_env.make_envs)
+    with contextlib.ExitStack() as closing:
+        actors = ppo.Actors(SMALL, tmp_path, closing)
+        agent = ppo.make_agent(*actors.spaces, SMALL, {})
+        actors.distribute(agent, torch.device("cpu"))
+        for use in (lambda: actors.rollout(0, is_first=True), lambda: actors.evaluate(0)):
+            actors.agent = copy.deepcopy(agent)
+            with torch.no_grad():
+                agent.critic[-1].bias += 1
+            use()
+            assert torch.equal(actors.agent.critic[-1].bias, agent.critic[-1].bias)
 
 
 PEG = replace(TWO, env_id="PegInsertionSide-v1")
