@@ -43,7 +43,6 @@ import shlex
 import shutil
 import signal
 import sys
-import sysconfig
 import tempfile
 import threading
 import time
@@ -122,7 +121,8 @@ gc.freeze()  # ManiSkill collects garbage whenever it builds scenes: exempt what
 RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RANK", 0))  # set by torchrun
 WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
-PACKAGES = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))  # their folders
+# how the file names of installed packages begin
+PACKAGES = ("<frozen", *(str(Path(x).parent) for x in (os.__file__, Path(gym.__file__).parent, mani_skill.__file__)))
 SCRIPT = Path(__file__)
 
 
