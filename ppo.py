@@ -798,8 +798,8 @@ class Film:
             return
         path = self.folder / f"{name}.mp4"
         try:
-            if find_render_error(self.args):
-                raise RunError(find_render_error(self.args))
+            if reason := find_render_error(self.args):
+                raise RunError(reason)
             if self.envs is None:
                 self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
                 self.closing.callback(self.envs.close)

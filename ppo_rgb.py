@@ -332,8 +332,8 @@ def check_observations(args: Args) -> None:
         fail(f"--shader minimal renders no {args.obs_mode}: use --shader default")
     if args.render_backend == "none":
         fail("--render_backend none: images must be rendered; ppo.py learns from the state")
-    if find_render_error(args):
-        fail(f"{find_render_error(args)}; ppo.py learns from the state")
+    if reason := find_render_error(args):
+        fail(f"{reason}; ppo.py learns from the state")
 
 
 class ImageObservations(flatten.FlattenRGBDObservationWrapper):
@@ -997,8 +997,8 @@ class Film:
             return
         path = self.folder / f"{name}.mp4"
         try:
-            if find_render_error(self.args):
-                raise RunError(find_render_error(self.args))
+            if reason := find_render_error(self.args):
+                raise RunError(reason)
             if self.envs is None:
                 self.envs = make_envs(self.args, self.num_envs, seed, evaluation=True, film=True)
                 self.closing.callback(self.envs.close)

@@ -7,7 +7,6 @@ import contextlib
 import fcntl
 import json
 import shutil
-import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -202,10 +201,9 @@ def crash():
 @pytest.fixture
 def signals(script):
     """Signals stop a run as they do in `main`."""
-    handlers = {s: signal.signal(s, script.stop) for s in script.STOP_SIGNALS}
+    handlers = script.set_handlers(dict.fromkeys(script.STOP_SIGNALS, script.stop))
     yield
-    for s, handler in handlers.items():
-        signal.signal(s, handler)
+    script.set_handlers(handlers)
 
 
 def refused(arguments, capsys, script=ppo):

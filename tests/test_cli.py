@@ -180,6 +180,26 @@ def test_help_may_be_cut_off(tmp_path):
 
 
 @pytest.mark.slow
+def test_other_kinds_of_task(tmp_path):
+    """Tasks with Dict action spaces, without success, with other robots or with sparse reward train without Vulkan."""
+    env_ids = ("TwoRobotPickCube-v1", "MS-HopperHop-v1", "DrawTriangle-v1", "PullCubeTool-v1")
+    flags = [*map(str, TINY), "--num_envs", "2", "--num_actors", "1", "--env_kwargs", '{"max_episode_steps": 10}']
+    (tmp_path / "all.py").write_text(f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+import ppo
+if __name__ == "__main__":
+    assert not any(ppo.main([*{flags!r}, "--env_id", x, "--exp_name", x]) for x in {env_ids!r})
+""")
+    process = run_script(cwd=tmp_path, env=NO_VULKAN, script=tmp_path / "all.py")
+    assert process.returncode == 0, process.stderr
+    for env_id in env_ids:
+        rows = read_metrics(tmp_path / "runs" / env_id)
+        assert rows[-1]["kind"] == "eval" and rows[-1]["episode_len"] == 10
+        assert ("success_once" in rows[-1]) == (env_id != "MS-HopperHop-v1")
+
+
+@pytest.mark.slow
 def test_terminal_without_vulkan_shows_one_bar_and_lines_that_stay(tmp_path):
     """One of the lines says why there is no video, and how to get a renderer. The last one repeats `uv run`."""
     uv_run = {"UV_RUN_RECURSION_DEPTH": "1"}
