@@ -297,9 +297,6 @@ LIMITS = (  # of numbers, if given; none may be infinite or not a number
     (-20, 5, "logstd_init"),
 )  # fmt: skip
 
-# best.pt has the highest success rate of all evaluations; if two are equal, the higher return decides
-BEST_BY = ("success_once", "return")
-
 
 # ----- Environment ----------------------------------------------------------------------------------------------------
 def check_observations(args: Args) -> None:
@@ -546,6 +543,12 @@ def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
     return obs, sums
 
 
+def score(episodes: dict[str, torch.Tensor]) -> list[float]:
+    """What best.pt is chosen by: the success rates at some step and at the last one, added; if equal, the return."""
+    rates = [episodes[name].mean().item() for name in ("success_once", "success_at_end") if name in episodes]
+    return [sum(rates), episodes["return"].mean().item()]
+
+
 def train(args: Args, closing: contextlib.ExitStack) -> None:
     """A run from its first evaluation to its last checkpoint. However it ends, `closing` then writes last.pt, closes
     the files and ends the actors."""
@@ -597,7 +600,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
             episodes = actors.evaluate(args.eval_seed)
             metrics = {key: values.mean().item() for key, values in episodes.items()}
             logger.log("eval", global_step, metrics | {"num_episodes": len(episodes["return"])})
-            checkpoints.update_best([metrics[key] for key in BEST_BY if key in metrics])
+            if score(episodes) > checkpoints.best_score:  # perhaps by luck: as many other episodes count as well
+                more = actors.evaluate(args.eval_seed + len(episodes["return"]))
+                checkpoints.update_best(score(concatenate([episodes, more])))
             if local.capture_video:
                 film.record(actors.agent, f"videos/step_{global_step:09d}", args.eval_seed)
             is_solved = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
@@ -1565,7 +1570,7 @@ class Logger:
         self.file.flush()
         for key, value in finite.items():
             self.writer.add_scalar(f"{kind}/{key}", value, global_step)
-        names = {"success_once": "success", "return": "return", "episode_len": "length"}
+        names = {"success_once": "success", "success_at_end": "at end", "return": "return", "episode_len": "length"}
         summary = [f"{name} {metrics[key]:.3g}" for key, name in names.items() if key in metrics]
         if kind == "eval":
             tqdm.write(f"step {global_step:>9,}  evaluation: {', '.join(summary)}")
@@ -1589,12 +1594,13 @@ class Logger:
 
 
 def plot_learning_curve(run_dir: Path) -> None:
-    """Draw learning_curve.png from metrics.jsonl: success, if the task has it, and return over steps."""
+    """Draw learning_curve.png from metrics.jsonl: success at some step and at the last one, if the task has it, and
+    return over steps."""
     from matplotlib.figure import Figure
 
     rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
-    keys = [key for key in ("success_once", "return") if key in rows[0]]
-    figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
+    keys = [key for key in ("success_once", "success_at_end", "return") if key in rows[0]]
+    figure = Figure(figsize=(4 * len(keys), 3.5), layout="constrained")
     for axis, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys):
         for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
             points = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind and key in row]

@@ -119,13 +119,13 @@ def test_a_finished_run_can_go_on(train, in_tmp):
 
 def test_signal_in_the_last_evaluation(train, in_tmp, monkeypatch, signals):
     """Resuming the run repeats that evaluation. Only then is the run finished."""
-    evaluate, calls, flags = ppo.evaluate, [], dict(RUN, eval_freq=0)
+    evaluate, first_looks, flags = ppo.evaluate, [], dict(RUN, eval_freq=0)
 
-    def stop_in_the_second(*args, **kwargs):
-        calls.append(1)
-        if len(calls) == 2:
+    def stop_in_the_second(agent, envs, args, num_episodes, seed, *others):
+        first_looks.append(seed == args.eval_seed)
+        if sum(first_looks) == 2:
             signal_self()
-        return evaluate(*args, **kwargs)
+        return evaluate(agent, envs, args, num_episodes, seed, *others)
 
     with monkeypatch.context() as patch:
         patch.setattr(ppo, "evaluate", stop_in_the_second)

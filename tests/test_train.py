@@ -46,7 +46,7 @@ class Run:
     """Runs `train` and records what happens in each iteration."""
 
     def __init__(self, monkeypatch, args, evaluations=None):
-        self.args, self.iterations, self.evaluations = args, [], []
+        self.args, self.iterations, self.evaluations, self.second_looks = args, [], [], []
         rollout, update, evaluate = ppo.rollout, ppo.update_minibatch, ppo.evaluate
 
         def make_envs(args, num_envs, seed, evaluation=False, record=None):
@@ -76,9 +76,19 @@ class Run:
 
         def spy_evaluate(agent, envs, *arguments, **flags):
             result = evaluate(agent, envs, *arguments, **flags)
+            seed = arguments[2]
+            if seed == args.eval_seed:
+                self.evaluations.append(copied(agent.state_dict()))
+                self.second_looks.append(False)
+            else:  # at a policy that may be the best
+                assert seed == args.eval_seed + self.num_first
+                self.second_looks[-1] = True
             if evaluations:
-                result = {k: torch.tensor(v).float() for k, v in evaluations[len(self.evaluations)].items()}
-            self.evaluations.append(copied(agent.state_dict()))
+                result = evaluations[len(self.evaluations) - 1]
+                half = len(result["return"]) // 2
+                half = slice(half, None) if self.second_looks[-1] else slice(half)
+                result = {k: torch.tensor(v[half]).float() for k, v in result.items()}
+            self.num_first = len(result["return"])
             return result
 
         monkeypatch.setattr(ppo, "make_envs", make_envs)
@@ -283,38 +293,53 @@ def test_training_rows(run):
     assert [row["global_step"] for row in record.train_rows] == [48, 96, 144, 192]
 
 
-def scripted(*scores):
-    return [dict(zip(("success_once", "return"), score)) for score in scores]
+def scripted(*evaluations):
+    """Evaluations of two episodes, and two more if there is a second look: success at some step and at the end, and
+    return."""
+    return [dict(zip(("success_once", "success_at_end", "return"), x)) for x in evaluations]
+
+
+NONE, HALF, ALL = [0, 0, 0, 0], [0, 1, 0, 1], [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
-    "scores, best",
+    "evaluations, best, looks_twice",
     [
         # success counts first, whatever the return
-        ([([0, 0], [5, 5]), ([0, 1], [0, 1]), ([0, 0], [9, 9]), ([0, 1], [2, 2]), ([0, 1], [1, 1])], 3),
+        ([(NONE, NONE, [5] * 4), (HALF, HALF, [0] * 4), (NONE, NONE, [9] * 4), (HALF, HALF, [2] * 4)], 3, [1, 1, 0, 1]),
+        # to stay counts as much as to arrive
+        ([(HALF, HALF, [0] * 4), (ALL, NONE, [5] * 4), (ALL, HALF, [1] * 4), (ALL, NONE, [9] * 4)], 2, [1, 1, 1, 0]),
         # of equal scores the first one is kept
-        ([([1, 1], [3, 3]), ([1, 1], [3, 3]), ([1, 1], [2, 3]), ([1, 1], [3, 3]), ([0, 1], [9, 9])], 0),
+        ([(ALL, ALL, [3] * 4), (ALL, ALL, [3] * 4), (ALL, ALL, [2, 3, 3, 3]), (HALF, HALF, [9] * 4)], 0, [1, 0, 0, 0]),
+        # the second look decides: here the first episodes were luck
+        ([(HALF, HALF, [1] * 4), ([1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]), (NONE, NONE, [9] * 4)], 0, [1, 1, 0]),
         # a score that is not finite is never the best
-        ([([0, 0], [1, 1]), ([1, 1], [math.nan, 3]), ([0, 1], [math.inf, 3]), ([0, 1], [1, 1]), ([0, 0], [1, 1])], 3),
+        ([(NONE, NONE, [1] * 4), (ALL, ALL, [math.nan, 3, 3, 3]), (HALF, HALF, [1] * 4)], 2, [1, 1, 1]),
     ],
-)
-def test_the_best_checkpoint(run, scores, best):
-    record = run(scripted(*scores))
+)  # fmt: skip
+def test_the_best_checkpoint(run, evaluations, best, looks_twice):
+    evaluations += [(NONE, NONE, [0] * 4)] * (ITERATIONS + 1 - len(evaluations))
+    looks_twice += [0] * (ITERATIONS + 1 - len(looks_twice))
+    record = run(scripted(*evaluations))
     checkpoint = record.checkpoint("best.pt")
     assert checkpoint["iteration"] == best and checkpoint["global_step"] == best * NUM_ENVS * NUM_STEPS
     assert all(torch.equal(v, checkpoint["agent"][k]) for k, v in record.evaluations[best].items())
-    assert checkpoint["best_score"] == [pytest.approx(np.mean(x)) for x in scores[best]]
+    once, at_end, returns = evaluations[best]
+    assert checkpoint["best_score"] == [pytest.approx(np.mean(once) + np.mean(at_end)), pytest.approx(np.mean(returns))]
+    assert record.second_looks == looks_twice
+    assert [row["num_episodes"] for row in record.eval_rows] == [2] * (ITERATIONS + 1), "curves show the first look"
+    assert [row["success_once"] for row in record.eval_rows] == [np.mean(x[0][:2]) for x in evaluations]
     assert record.checkpoint("last.pt")["iteration"] == ITERATIONS
 
 
 def test_without_success_the_return_decides(run):
-    record = run([{"return": [x]} for x in (-5.0, -2.0, -3.0, -1.0, -4.0)])
+    record = run([{"return": [x] * 4} for x in (-5.0, -2.0, -3.0, -1.0, -4.0)])
     assert record.checkpoint("best.pt")["iteration"] == 3
 
 
 @pytest.mark.parametrize("rate, last", [(0.5, 2), (1.0, 3), (None, 4)])
 def test_stop_at_success(run, rate, last):
-    record = run(scripted(*[(x, [0, 0]) for x in ([0, 0], [0, 0], [0, 1], [1, 1], [0, 0])]), stop_at_success=rate)
+    record = run(scripted(*[(x, NONE, NONE) for x in (NONE, NONE, HALF, ALL, NONE)]), stop_at_success=rate)
     assert record.checkpoint("last.pt")["iteration"] == last and len(record.iterations) == last
     assert len(record.eval_rows) == last + 1
 
@@ -412,8 +437,8 @@ def test_a_real_task(in_tmp):
     assert [row["num_episodes"] for row in rows] == [5, 4, 8, 5] and rows[-1]["kind"] == "eval"
     assert all(row["episode_len"] == 10 and math.isfinite(row["return"]) for row in rows)
     episodes = json.loads((in_tmp / "runs/x/videos/trajectory_0.json").read_text())["episodes"]
-    assert len(episodes) == 12 and all(e["elapsed_steps"] == 10 for e in episodes), (
-        "two evaluations, each of two rounds of three episodes"
+    assert len(episodes) in (18, 24) and all(e["elapsed_steps"] == 10 for e in episodes), (
+        "two evaluations, each of two rounds of three episodes; and a second look at the first policy, or at both"
     )
 
 
