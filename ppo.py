@@ -169,6 +169,8 @@ class Args:
     """number of processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
     """end a training episode at success or failure; --no-partial_reset: only at the time limit"""
+    success_steps: float = 10.0
+    """steps of success before a training episode ends, on average, so that the policy learns to stay (1: the first)"""
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
@@ -276,7 +278,7 @@ class Args:
 # On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
 CPU_DEFAULTS = dict(
     total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, eval_freq=10,
+    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, eval_freq=10,
 )  # fmt: skip
 CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
 UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and stall if other work takes its core
@@ -288,7 +290,7 @@ FIXED_FLAGS = (
 
 LIMITS = (  # of numbers, if given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
-              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+              "num_eval_steps success_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale"),
     (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq "
               "reconfiguration_freq eval_reconfiguration_freq"),
@@ -303,6 +305,22 @@ def check_observations(args: Args) -> None:
     """Refuse observations that `Agent` cannot see."""
     if args.obs_mode != "state":
         fail(f"--obs_mode {args.obs_mode}: this script learns from the state; ppo_rgb.py learns from images")
+
+
+class GoOnAfterSuccess(gym.Wrapper):
+    """A training episode ends at each step of success with the chance 1 / success_steps, and at failure. If the first
+    success ended it, PPO would never see the states after it, and the robot would not learn to stay."""
+
+    def __init__(self, env: gym.Env, success_steps: float):
+        super().__init__(env)
+        self.chance = 1 / success_steps
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if "success" in info:
+            goes_on = info["success"] & (torch.rand(terminated.shape, device=terminated.device) >= self.chance)
+            terminated = terminated & ~goes_on | info.get("fail", torch.zeros_like(goes_on))
+        return obs, reward, terminated, truncated, info
 
 
 def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
@@ -327,7 +345,7 @@ def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = F
     env = make_task(args.env_id, **kwargs)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = flatten.FlattenActionSpaceWrapper(env)
-    return env
+    return env if evaluation else GoOnAfterSuccess(env, args.success_steps)
 
 
 # ----- Agent ----------------------------------------------------------------------------------------------------------

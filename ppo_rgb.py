@@ -177,6 +177,8 @@ class Args:
     """number of processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
     """end a training episode at success or failure; --no-partial_reset: only at the time limit"""
+    success_steps: float = 10.0
+    """steps of success before a training episode ends, on average, so that the policy learns to stay (1: the first)"""
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
@@ -306,7 +308,7 @@ FIXED_FLAGS = (
 
 LIMITS = (  # of numbers, if given; none may be infinite or not a number
     (1, 1e18, "num_envs num_eval_envs num_actors num_steps num_minibatches update_epochs num_eval_episodes "
-              "num_eval_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
+              "num_eval_steps success_steps total_timesteps checkpoint_freq save_freq save_train_video_freq"),
     (1e-12, 1e12, "learning_rate desired_kl clip_coef max_grad_norm reward_scale"),
     (0, 1e18, "seed critic_learning_rate logstd_lr_factor ent_coef vf_coef target_kl eval_freq "
               "reconfiguration_freq eval_reconfiguration_freq"),
@@ -403,6 +405,22 @@ class ImageObservations(flatten.FlattenRGBDObservationWrapper):
         return nn.functional.pad(image, (0, 0, 0, -image.shape[2] % 16, 0, -image.shape[1] % 16))
 
 
+class GoOnAfterSuccess(gym.Wrapper):
+    """A training episode ends at each step of success with the chance 1 / success_steps, and at failure. If the first
+    success ended it, PPO would never see the states after it, and the robot would not learn to stay."""
+
+    def __init__(self, env: gym.Env, success_steps: float):
+        super().__init__(env)
+        self.chance = 1 / success_steps
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if "success" in info:
+            goes_on = info["success"] & (torch.rand(terminated.shape, device=terminated.device) >= self.chance)
+            terminated = terminated & ~goes_on | info.get("fail", torch.zeros_like(goes_on))
+        return obs, reward, terminated, truncated, info
+
+
 def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
     """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
     modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
@@ -428,6 +446,8 @@ def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = F
     env = ImageObservations(make_task(args.env_id, **kwargs | dict(sensor_configs=cameras)), args)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = flatten.FlattenActionSpaceWrapper(env)
+    if not evaluation:
+        env = GoOnAfterSuccess(env, args.success_steps)
     return env
 
 

@@ -200,7 +200,7 @@ def test_driver_too_old(in_tmp, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "arguments, note",
     [
-        ("--env_id MS-CartpoleSwingUp-v1", "--gamma 0.8 looks 5 steps ahead, and an episode has 1000"),
+        ("--env_id MS-CartpoleSwingUp-v1", "--gamma 0.9 looks 10 steps ahead, and an episode has 1000"),
         ("", None),
         ("--gamma 0.99 --env_id MS-CartpoleSwingUp-v1", None),
     ],

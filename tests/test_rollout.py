@@ -122,8 +122,9 @@ def fresh_episode():
     return Counter(steps=0, reward=0.0, success=False, fail=False)
 
 
-def replay(network, args, first_obs, steps, episodes):
-    """Returns what a rollout must store, sum up and return. `episodes` holds the unfinished episodes and is updated."""
+def replay(network, args, first_obs, steps, episodes, draws=None):
+    """Returns what a rollout must store, sum up and return. `episodes` holds the unfinished episodes and is updated.
+    `draws` (num_steps, num_envs) decide, where success_steps is more than 1, which successes end an episode."""
     num_envs = len(first_obs)
     names = ("obs", "rewards", "dones", "values", "next_values", "sent")
     wanted = {name: [[None] * num_envs for _ in steps] for name in names}
@@ -133,7 +134,8 @@ def replay(network, args, first_obs, steps, episodes):
         for t, step in enumerate(steps):
             next_obs = step["obs"][env].double().numpy()
             info = {k: v[env].item() for k, v in step["info"].items() if getattr(v, "shape", 0) == (num_envs,)}
-            terminated = args.partial_reset and (info.get("success", False) or info.get("fail", False))
+            success_ends = args.success_steps == 1 or draws[t, env] < 1 / args.success_steps
+            terminated = args.partial_reset and (info.get("success", False) and success_ends or info.get("fail", False))
             truncated = step["truncated"][env].item()
             reward = step["reward"][env].item()
             done = terminated or truncated
@@ -199,10 +201,10 @@ def gae_of_episodes(wanted, gamma, lam, finite_horizon):
     return advantages
 
 
-def compare(agent, args, spy, first_obs, storage, sums, last_obs, episodes):
+def compare(agent, args, spy, first_obs, storage, sums, last_obs, episodes, draws=None):
     """Compare a rollout with its replay; returns how many episodes ended in each way, and the replay."""
     network = Network(agent)
-    wanted, wanted_sums, ends, wanted_last_obs = replay(network, args, first_obs, spy.steps, episodes)
+    wanted, wanted_sums, ends, wanted_last_obs = replay(network, args, first_obs, spy.steps, episodes, draws)
     got = {k: v.double().numpy() for k, v in storage.items()}
     close = dict(rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(got["obs"], wanted["obs"])
@@ -230,16 +232,20 @@ def compare(agent, args, spy, first_obs, storage, sums, last_obs, episodes):
 
 
 ARGS = replace(SMALL, num_envs=12, num_steps=20, gamma=0.9, gae_lambda=0.8, reward_scale=0.3, logstd_init=-0.7)
+ARGS.success_steps = 1.0
 
 
 @pytest.mark.parametrize("norm_obs", [False, True])
 @pytest.mark.parametrize("partial_reset", [True, False])
 @pytest.mark.parametrize("rule", ["always", "truncated", "never"])
-def test_equals_replay(rule, partial_reset, norm_obs):
+@pytest.mark.parametrize("success_steps", [1.0, 1.5])
+def test_equals_replay(success_steps, rule, partial_reset, norm_obs):
     """Two rollouts in a row equal their replays. The second continues the episodes of the first."""
     args = replace(ARGS, bootstrap_at_done=rule, partial_reset=partial_reset, norm_obs=norm_obs)
+    args.success_steps = success_steps
     spy = Spy(Reach(args.num_envs))
-    envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=not partial_reset, record_metrics=True)
+    task = ppo.GoOnAfterSuccess(spy, success_steps)
+    envs = ppo.ManiSkillVectorEnv(task, ignore_terminations=not partial_reset, record_metrics=True)
     agent = make_agent(box(4), spy.get_wrapper_attr("single_action_space"), args)
     network, (obs, _) = Network(agent), envs.reset()
     episodes, all_ends, ended_by = [fresh_episode() for _ in range(args.num_envs)], Counter(), Counter()
@@ -249,12 +255,14 @@ def test_equals_replay(rule, partial_reset, norm_obs):
         torch.manual_seed(number)
         obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value)
         assert not any(x.requires_grad for x in [*storage.values(), *sums.values()])
-        ends, wanted = compare(agent, args, spy, first_obs, storage, sums, obs, episodes)
+        # what is drawn in each step: the noise of the actions, and which successes end an episode
+        torch.manual_seed(number)
+        drawn = [(torch.randn(args.num_envs, 2), torch.rand(args.num_envs)) for _ in range(args.num_steps)]
+        noise, draws = (torch.stack(x).double().numpy() for x in zip(*drawn))
+        ends, wanted = compare(agent, args, spy, first_obs, storage, sums, obs, episodes, draws)
         all_ends += ends
         ended_by += Counter({k: v.item() for k, v in sums.items() if k in ("success_at_end", "fail_at_end")})
         # each action is the policy's mean plus its standard deviation times fresh noise
-        torch.manual_seed(number)
-        noise = torch.stack([torch.randn(args.num_envs, 2) for _ in range(args.num_steps)]).double().numpy()
         actions = network.mean(wanted["obs"]) + np.exp(network.logstd) * noise
         np.testing.assert_allclose(storage["actions"], actions, rtol=1e-4, atol=1e-4)
         if norm_obs:
@@ -284,9 +292,41 @@ PUSH = ppo.Args(
 )  # fmt: skip
 
 
+@register_env("Succeeds-v0", max_episode_steps=200)
+class Succeeds(PushCubeEnv):
+    """Success at each step, and failure in the last environment."""
+
+    def evaluate(self):
+        fail = torch.arange(self.num_envs) == self.num_envs - 1
+        return dict(success=torch.ones(self.num_envs, dtype=torch.bool), fail=fail)
+
+
+@pytest.mark.parametrize("success_steps", [1.0, 4.0])
+def test_training_goes_on_after_success(success_steps):
+    """On average for success_steps, but not after failure. Episodes of evaluation follow their own flag."""
+    args = replace(PUSH, env_id="Succeeds-v0", success_steps=success_steps, env_kwargs="{}")
+    envs = ppo.make_envs(args, 33, 0)
+    envs.reset(seed=[*range(33)])
+    torch.manual_seed(0)
+    action, lengths = torch.zeros(33, 8), [[] for _ in range(33)]
+    for _ in range(40):
+        infos = envs.step(action)[4]
+        for i in infos["_final_info"].nonzero() if "_final_info" in infos else ():
+            lengths[i].append(infos["final_info"]["episode"]["episode_len"][i].item())
+    assert lengths.pop() == [1] * 40
+    lengths = sum(lengths, [])
+    assert np.mean(lengths) == pytest.approx(success_steps, rel=0.2) and len(set(lengths)) > 3 * (success_steps - 1)
+    envs.close()
+    for ends_early in (True, False):
+        envs = ppo.make_envs(replace(args, eval_partial_reset=ends_early), 2, 0, evaluation=True)
+        envs.reset(seed=[0, 1])
+        assert all(envs.step(action[:2])[2].tolist() == [ends_early] * 2 for _ in range(3))
+        envs.close()
+
+
 @pytest.mark.parametrize("rule, partial_reset", [("always", True), ("truncated", False), ("never", True)])
 def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
-    args = replace(PUSH, bootstrap_at_done=rule, partial_reset=partial_reset, norm_obs=True)
+    args = replace(PUSH, bootstrap_at_done=rule, partial_reset=partial_reset, norm_obs=True, success_steps=1.0)
     spy = Spy(ppo.make_env(args, args.num_envs))
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=not partial_reset, record_metrics=True)
     agent = make_agent(envs.single_observation_space, envs.single_action_space, args)
@@ -414,7 +454,7 @@ class OtherCubes(PushCubeEnv):
 def test_every_training_episode_ends_by_itself(num_envs, num_actors, monkeypatch):
     """New scenes cut no episode that a rollout has begun, and each of these is counted once."""
     args = replace(TWO, env_id="OtherCubes-v0", num_envs=num_envs, num_actors=num_actors, num_eval_envs=num_actors)
-    args.num_steps = 4
+    args.num_steps, args.success_steps = 4, 1.0
     rollout, in_rollout = ppo.rollout, []
 
     def spy_rollout(*arguments):

@@ -17,7 +17,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out")
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--metric", default="success_once")
+    parser.add_argument("--metrics", nargs="+", default=["success_once", "success_at_end"], help="drawn - and --")
     parser.add_argument("--video", help="video whose frames are put below the curves")
     parser.add_argument("--frames", type=int, default=6)
     options = parser.parse_args()
@@ -25,14 +25,15 @@ def main():
     figure = Figure(figsize=(10, 5 if options.video else 3.2), layout="constrained")
     above, *below = figure.subfigures(2, 1, height_ratios=[3, 2]) if options.video else [figure]
     by_steps, by_minutes = above.subplots(1, 2, sharey=True)
-    for run in options.runs:
-        steps, seconds, values = zip(*learning_curve(run, options.metric))
+    for i, run in enumerate(options.runs):
         args = json.loads((run / "args.json").read_text())["args"]
-        for axis, x in ((by_steps, steps), (by_minutes, [x / 60 for x in seconds])):
-            axis.plot(x, values, marker="o", markersize=3, label=run.name)
-    by_steps.set(xlabel="environment steps", ylabel=f"{options.metric}, evaluation")
+        for metric, style in zip(options.metrics, ("-", "--")):
+            steps, seconds, values = zip(*learning_curve(run, metric))
+            for axis, x in ((by_steps, steps), (by_minutes, [x / 60 for x in seconds])):
+                axis.plot(x, values, f"C{i}{style}", marker="o", markersize=3, label=f"{run.name}: {metric}")
+    by_steps.set(xlabel="environment steps", ylabel="evaluation")
     by_minutes.set(xlabel="minutes of training (rollout and update)")
-    by_minutes.legend(loc="lower right")
+    by_minutes.legend(loc="lower right", fontsize=7)
     for axis in (by_steps, by_minutes):
         axis.grid(alpha=0.3)
     above.suptitle(args["env_id"])
