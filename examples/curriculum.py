@@ -2,8 +2,8 @@
 
     python ppo.py --env_id examples.curriculum:PushFurther-v1
 
-After --total_timesteps 250000, 63, 64 and 63 of 64 evaluation episodes succeeded, all at full difficulty (seeds 1 to 3,
-measured with an earlier version); the mean level of training rose from 0 to 0.88, 0.96 and 0.94.
+After --total_timesteps 250000, 249 of 256 other episodes succeeded at some step, and 232 at the last one, all at full
+difficulty (one run, seed 4).
 
 It teaches more than examples/push_to_goal.py: how reset's `options` set what an episode is, and where they come from
 when training resets by itself. ManiSkillVectorEnv resets the environments whose episodes ended with

@@ -2,9 +2,8 @@
 
     python ppo.py --env_id examples.push_to_goal:PushToGoal-v1
 
-After --total_timesteps 250000, 58, 62 and 62 of 64 evaluation episodes succeeded at some step (seeds 1 to 3, measured
-with an earlier version). The policy does not learn to hold the cube at the goal, because training episodes end there;
---no-partial_reset teaches that.
+After --total_timesteps 400000, 237 of 256 other episodes succeeded at some step, and 190 at the last one (one run,
+seed 4). Training episodes go on after success (--success_steps), so that the policy learns to leave the cube there.
 
 A task defines five things: what is in the scene (`_load_scene`, once), how an episode starts (`_initialize_episode`, at
 each reset, for the environments that reset), what success and failure are (`evaluate`), what the policy sees besides
@@ -99,7 +98,8 @@ class PushToGoalEnv(BaseEnv):
     # --- success, observation, reward ---
 
     def evaluate(self):
-        """Tensors (num_envs,). `success` and `fail` end a training episode; others are logged as final_<name>."""
+        """Tensors (num_envs,). `success`, after some steps, and `fail` end a training episode; others are logged as
+        final_<name>."""
         distance, fell = self.distance(), self.cube.pose.p[:, 2] < 0
         progress = 1 - distance / self.first_distance
         return {"success": (distance < self.goal_radius) & ~fell, "fail": fell, "progress": progress}

@@ -307,7 +307,9 @@ def test_videos_and_trajectories(in_tmp, capfd):
     files = sorted(path.name for path in (run / "videos").iterdir() if path.suffix != ".mp4")
     assert files == [f"trajectory_{i}.{suffix}" for i in range(2) for suffix in ("h5", "json")]
     episodes = json.loads((run / "videos/trajectory_1.json").read_text())["episodes"]
-    assert [(e["elapsed_steps"], e["episode_seed"]) for e in episodes] == [(8, 2), (8, 3)] * 2
+    assert all(e["elapsed_steps"] == 8 for e in episodes)
+    seeds = [e["episode_seed"] for e in episodes]
+    assert seeds[:6] == [2, 3, 6, 7, 2, 3] and seeds[6:] in ([], [6, 7]), "a second look at what may be the best"
     from mani_skill.trajectory import replay_trajectory
 
     flags = ("--traj-path", run / "videos/trajectory_1.h5", "--sim-backend", "physx_cpu", "--allow-failure",
