@@ -1618,7 +1618,7 @@ def plot_learning_curve(run_dir: Path) -> None:
 
     rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
     keys = [key for key in ("success_once", "success_at_end", "return") if key in rows[0]]
-    figure = Figure(figsize=(4 * len(keys), 3.5), layout="constrained")
+    figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
     for axis, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys):
         for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
             points = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind and key in row]
