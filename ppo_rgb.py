@@ -417,7 +417,9 @@ class GoOnAfterSuccess(gym.Wrapper):
         obs, reward, terminated, truncated, info = self.env.step(action)
         if "success" in info:
             goes_on = info["success"] & (torch.rand(terminated.shape, device=terminated.device) >= self.chance)
-            terminated = terminated & ~goes_on | info.get("fail", torch.zeros_like(goes_on))
+            terminated = terminated & ~goes_on
+        if "fail" in info:
+            terminated = terminated | info["fail"]
         return obs, reward, terminated, truncated, info
 
 
