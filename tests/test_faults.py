@@ -331,12 +331,12 @@ def test_flags_of_a_resumed_run(trained, in_tmp, capsys):
         with pytest.raises(SystemExit) as error:
             ppo.parse_args(["--resume", "runs/x", *flags.split()])
         assert error.value.code == 2 and re.match("--(no-)?([a-z_]+)", flags)[2] in capsys.readouterr().err
-    args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --gamma 0.9 --learning_rate 1".split())
-    assert (args.total_timesteps, args.eval_freq, args.gamma, args.learning_rate) == (1000, 3, 0.9, 1)
+    args = ppo.parse_args("--resume runs/x --total_timesteps 1000 --eval_freq 3 --gamma 0.7 --learning_rate 1".split())
+    assert (args.total_timesteps, args.eval_freq, args.gamma, args.learning_rate) == (1000, 3, 0.7, 1)
     assert (args.num_envs, args.num_steps, args.num_minibatches, args.seed) == (4, 20, 4, 1)
     assert ppo.find_run_dir(args) == Path("runs/x")
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("changed: ") and "--gamma 0.9 (was 0.8)" in line and line.count("was") == 4
+    assert line.startswith("changed: ") and "--gamma 0.7 (was 0.9)" in line and line.count("was") == 4
 
 
 def test_learning_rates_of_a_resumed_run(device):
