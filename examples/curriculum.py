@@ -2,8 +2,8 @@
 
     python ppo.py --env_id examples.curriculum:PushFurther-v1
 
-After --total_timesteps 250000, 249 of 256 other episodes succeeded at some step, and 232 at the last one, all at full
-difficulty (one run, seed 4).
+After --total_timesteps 250000, 0.90 to 0.97 of 256 other episodes succeeded at some step, and 0.87 to 0.93 at the last
+one, all at full difficulty (seeds 4 to 6).
 
 It teaches more than examples/push_to_goal.py: how reset's `options` set what an episode is, and where they come from
 when training resets by itself. ManiSkillVectorEnv resets the environments whose episodes ended with
