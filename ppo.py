@@ -347,7 +347,9 @@ def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = F
     env = make_task(args.env_id, **kwargs)
     if isinstance(env.action_space, gym.spaces.Dict):
         env = flatten.FlattenActionSpaceWrapper(env)
-    return env if evaluation else GoOnAfterSuccess(env, args.success_steps)
+    if not evaluation:
+        env = GoOnAfterSuccess(env, args.success_steps)
+    return env
 
 
 # ----- Agent ----------------------------------------------------------------------------------------------------------
