@@ -230,6 +230,8 @@ class Args:
     """normalise observations by their running mean and variance"""
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
+    logstd_final: Optional[float] = None
+    """upper limit of that logarithm, which falls from logstd_init over the second half of the run (None: no limit)"""
     compile: bool = False
     """compile the network with torch.compile, which takes a minute"""
     cudagraphs: bool = True
@@ -278,7 +280,8 @@ class Args:
 # On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
 CPU_DEFAULTS = dict(
     total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, eval_freq=10,
+    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, logstd_final=-2.0,
+    eval_freq=10,
 )  # fmt: skip
 CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
 UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and stall if other work takes its core
@@ -296,7 +299,7 @@ LIMITS = (  # of numbers, if given; none may be infinite or not a number
               "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
     (0, 2**30, "eval_seed"),
-    (-20, 5, "logstd_init"),
+    (-20, 5, "logstd_init logstd_final"),
 )  # fmt: skip
 
 
@@ -659,6 +662,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
                 break
         if args.norm_obs:  # only now: the update needs the rollout's log-probabilities
             agent.update_normalization(batch["obs"])
+        progress = (iteration + 1) / args.num_iterations
+        if args.logstd_final is not None and progress > 0.5:  # noise that is left hides where the mean falls short
+            limit = args.logstd_init + (2 * progress - 1) * (args.logstd_final - args.logstd_init)
+            agent.actor_logstd.data.clamp_(max=limit)
         torch.set_num_threads(1)
         global_step += args.batch_size
 

@@ -246,6 +246,8 @@ class Args:
     """normalise the state by its running mean and variance"""
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
+    logstd_final: Optional[float] = None
+    """upper limit of that logarithm, which falls from logstd_init over the second half of the run (None: no limit)"""
     compile: bool = False
     """compile the network with torch.compile, which takes a minute"""
     cudagraphs: bool = True
@@ -314,7 +316,7 @@ LIMITS = (  # of numbers, if given; none may be infinite or not a number
               "reconfiguration_freq eval_reconfiguration_freq"),
     (0, 1, "gamma gae_lambda stop_at_success"),
     (0, 2**30, "eval_seed"),
-    (-20, 5, "logstd_init"),
+    (-20, 5, "logstd_init logstd_final"),
     (1, 32, "frame_stack"),
     (8, 4096, "camera_width camera_height"),
     (0, 32, "random_shift"),
@@ -858,6 +860,10 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
                 break
         if args.norm_obs:  # only now: the update needs the rollout's log-probabilities
             agent.update_normalization(batch["obs"])
+        progress = (iteration + 1) / args.num_iterations
+        if args.logstd_final is not None and progress > 0.5:  # noise that is left hides where the mean falls short
+            limit = args.logstd_init + (2 * progress - 1) * (args.logstd_final - args.logstd_init)
+            agent.actor_logstd.data.clamp_(max=limit)
         torch.set_num_threads(1)
         global_step += args.batch_size
 

@@ -205,6 +205,18 @@ def test_learning_rate_follows_the_divergence(run, desired_kl, reached, anneal_l
     assert factors == reached
 
 
+def test_limit_of_the_standard_deviation(run):
+    """It falls in the second half of the run, after an update: the next one knows the policy that acted. Here the
+    standard deviation does not learn (logstd_lr_factor 0), so that the limit alone changes it."""
+    for logstd_final, expected in ((-2.0, [-0.5, -0.5, -0.5, -1.25, -2.0]), (0.0, [-0.5] * 5), (None, [-0.5] * 5)):
+        record = run(logstd_final=logstd_final, logstd_lr_factor=0.0, exp_name=f"final_{logstd_final}")
+        policies = [*(iteration["before"] for iteration in record.iterations), record.evaluations[-1]]
+        for policy, logstd in zip(policies, expected, strict=True):
+            assert policy["actor_logstd"].tolist() == [pytest.approx([logstd] * policy["actor_logstd"].numel())]
+        for iteration in record.iterations:
+            assert iteration["updates"][0]["metrics"][ppo.UPDATE_METRICS.index("approx_kl")] < 1e-6
+
+
 def test_training_from_a_checkpoint(run):
     """It goes on with the weights, Adam's moments and the adapted learning rates, and counts steps from zero: with the
     initial learning rate, the first updates would wreck a policy whose standard deviation has shrunk."""

@@ -69,14 +69,17 @@ def run_script(*command: str) -> None:
         sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
 
 
-def train(recipe: str, seed: int, flags: list[str], script: str) -> Path:
-    """The folder of the finished run."""
+def train(recipe: str, seed: int, flags: list[str], script: str, num_at_once: int) -> Path:
+    """The folder of the finished run. Runs at once share the cores: with processes for all of them, they would wait for
+    each other."""
     name = "_".join(["results", recipe, str(seed), *(flag.strip("-") for flag in flags)])
     run_dir = ROOT / "runs" / name
     if (run_dir / "last.pt").exists():
         run_script("python", script, "--resume", str(run_dir))
     else:
         own = ["--seed", str(seed), "--exp_name", name, "--no-capture_video"]
+        if num_at_once > 1:
+            own += ["--num_actors", str(max(1, os.cpu_count() // num_at_once))]
         run_script("bash", "examples/recipes.sh", recipe, *own, *flags)
     return run_dir
 
@@ -114,7 +117,7 @@ def main_metric(metrics: dict) -> str:
 def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict:
     script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
     commit = find_commit()  # the one that trains; there may be another when the row is written
-    run_dir = train(recipe, seed, flags, script)
+    run_dir = train(recipe, seed, flags, script, num_at_once)
     about = json.loads((run_dir / "args.json").read_text())
     best = evaluate(run_dir, script, "best.pt")
     last = best if has_same_weights(run_dir) else evaluate(run_dir, script, "last.pt")
