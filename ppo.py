@@ -228,6 +228,8 @@ class Args:
     """average the n-step returns that exist, instead of the infinite sum"""
     norm_obs: bool = False
     """normalise observations by their running mean and variance"""
+    layer_norm: bool = False
+    """normalise the hidden layers of policy and value (Ba et al. 2016, arXiv 1607.06450)"""
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
     logstd_final: Optional[float] = None
@@ -280,8 +282,8 @@ class Args:
 # On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
 CPU_DEFAULTS = dict(
     total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, logstd_final=-2.0,
-    eval_freq=10,
+    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, layer_norm=True,
+    logstd_final=-3.0, eval_freq=10,
 )  # fmt: skip
 CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
 UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and stall if other work takes its core
@@ -289,6 +291,7 @@ UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and 
 # These fix the task and the network: a resumed run cannot change them, and --checkpoint brings them along.
 FIXED_FLAGS = (
     "env_id", "obs_mode", "control_mode", "robot_uids", "reward_mode", "env_kwargs", "eval_partial_reset", "norm_obs",
+    "layer_norm",
 )  # fmt: skip
 
 LIMITS = (  # of numbers, if given; none may be infinite or not a number
@@ -372,12 +375,13 @@ class Agent(nn.Module):
     def __init__(self, obs_space: gym.spaces.Box, action_space: gym.spaces.Box, args: Args):
         super().__init__()
         obs_dim, act_dim = obs_space.shape[0], action_space.shape[0]
+        norm = nn.LayerNorm if args.layer_norm else nn.Identity
 
         def hidden_layers():
             return nn.Sequential(
-                layer_init(nn.Linear(obs_dim, 256)), nn.Tanh(),
-                layer_init(nn.Linear(256, 256)), nn.Tanh(),
-                layer_init(nn.Linear(256, 256)), nn.Tanh(),
+                layer_init(nn.Linear(obs_dim, 256)), norm(256), nn.Tanh(),
+                layer_init(nn.Linear(256, 256)), norm(256), nn.Tanh(),
+                layer_init(nn.Linear(256, 256)), norm(256), nn.Tanh(),
             )  # fmt: skip
 
         actor_layers, critic_layers = hidden_layers(), hidden_layers()

@@ -244,6 +244,8 @@ class Args:
     """run the encoder in bfloat16 (automatic mixed precision)"""
     norm_obs: bool = False
     """normalise the state by its running mean and variance"""
+    layer_norm: bool = False
+    """normalise the hidden layers of policy and value (Ba et al. 2016, arXiv 1607.06450)"""
     logstd_init: float = -0.5
     """initial logarithm of the policy's standard deviation (in ManiSkill's ppo.py -0.5, in its ppo_fast.py 0)"""
     logstd_final: Optional[float] = None
@@ -305,7 +307,7 @@ TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3,
 # These fix the task and the network: a resumed run cannot change them, and --checkpoint brings them along.
 FIXED_FLAGS = (
     "env_id", "obs_mode", "control_mode", "robot_uids", "reward_mode", "env_kwargs", "eval_partial_reset", "norm_obs",
-    "include_state", "frame_stack", "camera_width", "camera_height", "shader", "encoder",
+    "layer_norm", "include_state", "frame_stack", "camera_width", "camera_height", "shader", "encoder",
 )  # fmt: skip
 
 LIMITS = (  # of numbers, if given; none may be infinite or not a number
@@ -549,10 +551,11 @@ class Agent(nn.Module):
         self.encoder = Encoder(obs_space, args)
         self.state_layer = layer_init(nn.Linear(state_dim, 256)) if state_dim else None
         num_features = self.encoder.num_features + (256 if state_dim else 0)
+        norm = nn.LayerNorm if args.layer_norm else nn.Identity
 
         def head(size, std):
             return nn.Sequential(
-                layer_init(nn.Linear(num_features, 512)), nn.ReLU(),
+                layer_init(nn.Linear(num_features, 512)), norm(512), nn.ReLU(),
                 layer_init(nn.Linear(512, size), std),
             )  # fmt: skip
 

@@ -31,7 +31,7 @@ push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromC
 curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
 
 # Success comes late: without the bonus for entropy, the policy may stop exploring before its first success.
-lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
+lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --ent_coef 0.0075 --total_timesteps 800000 "$@"; }
 
 # The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. The cube has
 # far to go, so gamma is larger. Training episodes go on after success: if they ended, the arm would learn to go
@@ -46,7 +46,8 @@ grasp_cube_so100_cpu() {
 # With the adaptive learning rate and the fast standard deviation of the defaults, the policy explores too little.
 control() {
     python ppo.py --no-cuda --gamma 0.99 --gae_lambda 0.95 --num_steps 100 --num_minibatches 16 \
-        --desired_kl None --target_kl 0.1 --logstd_lr_factor 1 --num_eval_episodes 8 --eval_freq 5 "$@"
+        --desired_kl None --target_kl 0.1 --logstd_lr_factor 1 --logstd_final None --no-layer_norm \
+        --num_eval_episodes 8 --eval_freq 5 "$@"
 }
 
 cartpole_balance_cpu() { control --env_id MS-CartpoleBalance-v1 --total_timesteps 96000 "$@"; }

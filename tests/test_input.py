@@ -230,7 +230,7 @@ VALID = {
     "shader": ["minimal"], "wandb_entity": [None, "us"], "total_timesteps": [126, 500],
 }  # fmt: skip
 SWITCHES = [
-    "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "norm_obs", "save_model",
+    "anneal_lr", "norm_adv", "clip_vloss", "finite_horizon_gae", "norm_obs", "layer_norm", "save_model",
     "exact_resume", "partial_reset", "eval_partial_reset", "torch_deterministic", "cudagraphs",
 ]  # fmt: skip
 NUMBERS = ["0", "-1", "1.5.", "nan", "inf", "x", ""]

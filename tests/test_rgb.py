@@ -207,7 +207,7 @@ def test_textures_become_numbers_of_like_scale():
 def test_gradient_reaches_every_parameter(encoder, include_state, channels_last, device):
     args = replace(
         SMALL_IMAGES, obs_mode="rgb+depth+segmentation", encoder=encoder, include_state=include_state,
-        channels_last=channels_last,
+        channels_last=channels_last, layer_norm=True,
     )  # fmt: skip
     envs = batched_env.make_envs(args, 16, 0, device=device)
     agent = ppo_rgb.Agent(envs.single_observation_space, envs.single_action_space, args).to(device)

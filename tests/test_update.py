@@ -36,7 +36,12 @@ def reference_loss(args, agent, b):
     def mlp(layers, x):
         for layer in layers:
             if isinstance(layer, torch.nn.Linear):
-                x = torch.tanh(x @ layer.weight.T + layer.bias)
+                x = x @ layer.weight.T + layer.bias
+            elif isinstance(layer, torch.nn.LayerNorm):
+                x = x - x.mean(1, keepdim=True)
+                x = x / ((x**2).mean(1, keepdim=True) + 1e-5).sqrt() * layer.weight + layer.bias
+            elif isinstance(layer, torch.nn.Tanh):
+                x = torch.tanh(x)
         return x
 
     x = b["obs"]
@@ -75,7 +80,7 @@ def reference_loss(args, agent, b):
         dict(norm_adv=False, ent_coef=0.05),
         dict(clip_vloss=True, vf_coef=2.0, clip_coef=0.1),
         dict(max_grad_norm=0.01),
-        dict(norm_obs=True),
+        dict(norm_obs=True, layer_norm=True),
     ],
 )
 def test_one_step(flags):
