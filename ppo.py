@@ -282,8 +282,7 @@ class Args:
 # On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
 CPU_DEFAULTS = dict(
     total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, layer_norm=True,
-    logstd_final=-3.0, eval_freq=10,
+    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, eval_freq=10,
 )  # fmt: skip
 CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
 UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and stall if other work takes its core

@@ -139,7 +139,7 @@ def main():
     for shape in options.shapes:
         num_envs, num_steps = map(int, shape.split("x"))
         flags = (f"--num_envs {num_envs} --num_steps {num_steps} --num_minibatches {options.num_minibatches} "
-                 f"--update_epochs {options.update_epochs} --sim_backend physx_cpu --no-norm_obs --no-layer_norm "
+                 f"--update_epochs {options.update_epochs} --sim_backend physx_cpu --no-norm_obs "
                  f"--total_timesteps {num_envs * num_steps * options.iterations}")  # fmt: skip
         flags += "" if cuda else " --no-cuda"
         times = {name: [] for name in variants}
