@@ -1,9 +1,10 @@
 """The smallest complete task to copy: push a cube to a goal ahead of it on the table.
 
-    python ppo.py --env_id examples.push_to_goal:PushToGoal-v1
+    python ppo.py --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 400000 --layer_norm --logstd_final -3
 
-After --total_timesteps 400000, 237 of 256 other episodes succeeded at some step, and 190 at the last one (one run,
-seed 4). Training episodes go on after success (--success_steps), so that the policy learns to leave the cube there.
+Of 256 other episodes, 0.86 to 0.91 then succeeded at some step, and 0.81 to 0.82 at the last one (seeds 4 to 6).
+Training episodes go on after success (--success_steps), so that the policy learns to leave the cube there. The last two
+flags keep it from stopping just short of the goal.
 
 A task defines five things: what is in the scene (`_load_scene`, once), how an episode starts (`_initialize_episode`, at
 each reset, for the environments that reset), what success and failure are (`evaluate`), what the policy sees besides
