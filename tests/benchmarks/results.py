@@ -220,15 +220,18 @@ def write_table(rows: list[dict], path: Path) -> None:
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """A picture a recipe: the mean of the seeds, and their range."""
-    groups = group(rows)
+    """A picture a recipe, of its rows with the fewest further flags: the mean of the seeds, and their range."""
+    groups = {}
+    for runs in group(rows).values():
+        recipe = runs[0]["recipe"]
+        groups[recipe] = min(groups.get(recipe, runs), runs, key=lambda runs: len(runs[0]["further_flags"]))
     columns = min(5, len(groups))
     lines = math.ceil(len(groups) / columns)
     figure = Figure(figsize=(2.6 * columns, 2.1 * lines), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).flatten()
     for axis in axes[len(groups) :]:
         axis.axis("off")
-    for axis, (name, runs) in zip(axes, groups.items()):
+    for axis, (recipe, runs) in zip(axes, groups.items()):
         points = defaultdict(list)
         for run in runs:
             for steps, _, value in run["curve"]:
@@ -237,7 +240,8 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         values = [points[steps] for steps in x]
         axis.fill_between(x, [min(v) for v in values], [max(v) for v in values], alpha=0.3)
         axis.plot(x, [statistics.mean(v) for v in values])
-        axis.set_title(name.replace("_cpu", "").replace(" --", "\n--"), fontsize=8)
+        name = f"{recipe.removesuffix('_cpu')} {runs[0]['further_flags']}"
+        axis.set_title(name.replace(" --", "\n--"), fontsize=8)
         axis.tick_params(labelsize=7)
         is_rate = "success_once" in runs[0]["best"]
         axis.set_ylim(0, 1.03 if is_rate else None)
