@@ -103,7 +103,7 @@ class Network:
         return x
 
     def layers(self, name):
-        return [*(f"{name}.0.{i}" for i in (0, 2, 4)), f"{name}.1"]
+        return [*(f"{name}.0.{i}" for i in (0, 3, 6)), f"{name}.1"]
 
     def mean(self, obs):
         return self.forward(self.normalize(obs), self.layers("actor_mean"))
