@@ -1372,6 +1372,13 @@ def run_in_actor(method: str, *arguments):
     ACTOR = Actor(*arguments)
 
 
+def end_actors() -> None:
+    """Kill the processes of the actors, whatever they are doing."""
+    for process in mp.active_children():
+        process.kill()
+        process.join()
+
+
 def end_with_main_process() -> None:
     mp.parent_process().join()
     os._exit(1)
@@ -1440,11 +1447,12 @@ class Actors:
         return concatenate(all_gather(concatenate(self.call("evaluate", self.num_eval_episodes, seed))))
 
     def close(self) -> None:
-        has_failed = sys.exc_info()[0] is not None
-        if not has_failed:  # else `main` ends the processes, whatever they are doing
+        if sys.exc_info()[0] is None:
             self.call("close")
-        for pool in self.pools:
-            pool.shutdown(wait=not has_failed)
+        else:
+            end_actors()
+        for pool in self.pools:  # it waits: a thread of the pool that outlives the run may print a traceback
+            pool.shutdown()
 
 
 def make_storage(obs_space, action_space, args: Args, device: torch.device, learner_device: torch.device) -> dict:
@@ -1968,9 +1976,7 @@ def main(argv: list[str]) -> int:
             traceback.print_exc()
     finally:
         set_handlers(handlers)
-        for process in mp.active_children():
-            process.kill()
-            process.join()
+        end_actors()
     if args.evaluate or RANK > 0:
         return code
     command = f"{'uv run' if 'UV_RUN_RECURSION_DEPTH' in os.environ else 'python'} {sys.argv[0]}"
