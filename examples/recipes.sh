@@ -29,8 +29,7 @@ place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --tot
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
 curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
 
-# The cube must stop near the goal, where the reward hardly changes: with the default flags, the mean of the policy often
-# stops just short of it.
+# With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
 push_to_goal_cpu() {
     tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 400000 "$@"
 }
