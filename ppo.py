@@ -1372,13 +1372,6 @@ def run_in_actor(method: str, *arguments):
     ACTOR = Actor(*arguments)
 
 
-def end_actors() -> None:
-    """Kill the processes of the actors, whatever they are doing."""
-    for process in mp.active_children():
-        process.kill()
-        process.join()
-
-
 def end_with_main_process() -> None:
     mp.parent_process().join()
     os._exit(1)
@@ -1391,11 +1384,11 @@ class Actors:
         # Processes inherit this: they ignore these signals, and the main process ends them.
         handlers = set_handlers(dict.fromkeys(STOP_SIGNALS, signal.SIG_IGN))
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
+        closing.callback(self.close)
         further = enumerate(self.pools, start=1)
         self.built = [pool.submit(run_in_actor, "build", args, i, trajectory_dir) for i, pool in further]
         set_handlers(handlers)
         self.args, self.actor0 = args, Actor(args, 0, trajectory_dir)
-        closing.callback(self.close)
         if not args.evaluate:
             check_task(args, self.actor0.envs)
         envs = self.actor0.eval_envs
@@ -1449,8 +1442,9 @@ class Actors:
     def close(self) -> None:
         if sys.exc_info()[0] is None:
             self.call("close")
-        else:
-            end_actors()
+        else:  # whatever they are doing
+            for process in mp.active_children():
+                process.kill()
         for pool in self.pools:  # it waits: a thread of the pool that outlives the run may print a traceback
             pool.shutdown()
 
@@ -1976,7 +1970,6 @@ def main(argv: list[str]) -> int:
             traceback.print_exc()
     finally:
         set_handlers(handlers)
-        end_actors()
     if args.evaluate or RANK > 0:
         return code
     command = f"{'uv run' if 'UV_RUN_RECURSION_DEPTH' in os.environ else 'python'} {sys.argv[0]}"
