@@ -142,8 +142,9 @@ if __name__ == "__main__":  # torchrun runs this in each process
     ppo.Agent, ppo.make_envs = kept_agent, envs_that_record
     torch.distributed.destroy_process_group = lambda: None  # one_step needs the process group
     code = ppo.main(sys.argv[1:])
+    if code:  # one_step needs the other process: where the run was stopped, that one may still wait within an update
+        sys.exit(code)
     ppo.Agent = make_agent
     for script in (ppo, ppo_rgb):
         torch.save(one_step(script, 40, ppo.RANK, 2), f"{script.__name__}{ppo.RANK}.pt")
     torch.save({"agent": agents[0].state_dict(), "actions": actions[-1]}, f"rank{ppo.RANK}.pt")
-    sys.exit(code)
