@@ -178,8 +178,8 @@ FAULTS = {
         r"self.first_distance has 2 rows .* keeps num_envs rows: allocate it in _load_scene",
     ),
     "mean over environments": (
-        '        reward[info["success"]] = 3\n',
-        "        reward = reward.mean() + 0 * reward\n",
+        "torch.tanh(10 * reach)",
+        "torch.tanh(10 * reach.mean())",
         "the reward of an environment depends on the actions of the others",
     ),
     "unseeded numpy": (
