@@ -1,8 +1,8 @@
 """A self-paced curriculum: push the cube further as it is pushed more surely.
 
-    python ppo.py --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 --layer_norm --logstd_final -3
+    python ppo.py --env_id examples.curriculum:PushFurther-v1
 
-Then 0.90 to 0.97 of 256 other episodes succeeded at some step, and 0.87 to 0.93 at the last
+After --total_timesteps 250000, 0.91 to 0.96 of 256 other episodes succeeded at some step, and 0.88 to 0.96 at the last
 one, all at full difficulty (seeds 4 to 6).
 
 It teaches more than examples/push_to_goal.py: how reset's `options` set what an episode is, and where they come from

@@ -26,6 +26,7 @@ peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timeste
 two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
+curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
 
 # Twice the steps of an iteration (on 2 cores): with the default, the policy may hold the cube and never bring it to the
 # goal.
@@ -34,10 +35,9 @@ pick_cube_cpu() {
 }
 
 # With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
-push_precisely() { tabletop --layer_norm --logstd_final -3 "$@"; }
-
-push_to_goal_cpu() { push_precisely --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 400000 "$@"; }
-curriculum_cpu() { push_precisely --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
+push_to_goal_cpu() {
+    tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 400000 "$@"
+}
 
 # Success comes late: without the bonus for entropy, the policy may stop exploring before its first success.
 lift_peg_upright_cpu() { tabletop --env_id LiftPegUpright-v1 --ent_coef 0.0075 --total_timesteps 1600000 "$@"; }
