@@ -18,8 +18,6 @@ pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800
 # Its success rate goes up and down near 0.9: of 64 evaluation episodes, best.pt would be chosen by luck.
 place_sphere_cpu() { tabletop --env_id PlaceSphere-v1 --num_eval_episodes 128 --total_timesteps 1600000 "$@"; }
 stack_cube_cpu() { tabletop --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
-# With the default gamma, the policy may hold the peg still, and never push with it.
-poke_cube_cpu() { tabletop --env_id PokeCube-v1 --gamma 0.8 --gae_lambda 0.9 --total_timesteps 1200000 "$@"; }
 # The ball rolls on alone, so its reward comes late: ManiSkill's own gamma for this task.
 roll_ball_cpu() { tabletop --env_id RollBall-v1 --gamma 0.95 --total_timesteps 800000 "$@"; }
 pull_cube_tool_cpu() { tabletop --env_id PullCubeTool-v1 --total_timesteps 800000 "$@"; }
@@ -33,6 +31,13 @@ curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_
 # goal.
 pick_cube_cpu() {
     tabletop --env_id PickCube-v1 --num_steps 50 --num_minibatches 8 --eval_freq 10 --total_timesteps 800000 "$@"
+}
+
+# The robot must hold the peg, and align it, before it can push with it. With the defaults, the noise of the policy shrinks
+# before it finds out.
+poke_cube_cpu() {
+    tabletop --env_id PokeCube-v1 --num_steps 50 --num_minibatches 8 --gamma 0.8 --gae_lambda 0.9 --eval_freq 10 \
+        --total_timesteps 1200000 "$@"
 }
 
 # With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
