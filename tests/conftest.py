@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from pretended_gpu import pretended_gpu
 
 import ppo
 import ppo_rgb
@@ -77,9 +78,16 @@ def pytest_runtest_setup(item):
             (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a Vulkan device")
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request):
-    return torch.device(request.param)
+GPUS = ["pretended", pytest.param("cuda", marks=pytest.mark.gpu)]
+
+
+@pytest.fixture(params=["cpu", *GPUS])
+def device(request, monkeypatch):
+    if request.param == "pretended":
+        with pretended_gpu(monkeypatch):
+            yield torch.device("cuda")
+    else:
+        yield torch.device(request.param)
 
 
 @pytest.fixture
@@ -120,7 +128,8 @@ def small():
 @pytest.fixture
 def train(in_tmp, monkeypatch, device, script, small):
     """A function that trains in this process on the torch-native environments, with the given flags. Its runs are named
-    run1, run2, … It returns the metrics and the last checkpoint."""
+    run1, run2, … It returns the metrics and the last checkpoint. There are no CUDA graphs unless the test asks for
+    them, because a graph does not call what a test puts in place of a function."""
     monkeypatch.setattr(script, "make_envs", partial(batched_env.make_envs, device=device))
     monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # plotting takes longer than these runs
     count = 0
@@ -130,7 +139,8 @@ def train(in_tmp, monkeypatch, device, script, small):
         count += "resume" not in flags
         if "resume" in flags:
             flags["resume"] = script.load_checkpoint(flags["resume"])["path"]
-        args = replace(small, exp_name=f"run{count}", cuda=device.type == "cuda", **flags)
+        flags = dict(exp_name=f"run{count}", cuda=device.type == "cuda", cudagraphs=False) | flags
+        args = replace(small, **flags)
         with contextlib.ExitStack() as closing:
             script.train(args, closing)
         folder = script.find_run_dir(args)

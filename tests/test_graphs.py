@@ -1,19 +1,21 @@
 """Functions that the scripts launch as CUDA graphs give the same results as step by step, and do not make the host read
-a number.
-
-On the CPU, recorded_graph.py stands in for CUDA graphs."""
+a number: on the GPU that pretended_gpu.py pretends, and on a real one."""
 
 import dataclasses
 import math
 import subprocess
 import sys
+from collections import Counter
+from functools import partial
 from typing import Optional
 
 import pytest
 import test_rgb
 import torch
-from conftest import ROOT, SMALL, without_clock
-from recorded_graph import RecordedGraph
+import torch.nn as nn
+from conftest import GPUS, ROOT, SMALL, without_clock
+from pretended_gpu import GpuTensor, PretendedGpu
+from torch.distributions import Normal
 
 import ppo
 import ppo_rgb
@@ -29,24 +31,18 @@ def small(script):
     return SMALL if script is ppo else test_rgb.SMALL_IMAGES
 
 
-@pytest.fixture
-def with_graphs(train, script, device, monkeypatch):
-    def run(**flags):
-        with monkeypatch.context() as patch:
-            if device.type == "cpu":
-                patch.setattr(script, "CudaGraph", RecordedGraph)
-            return train(cudagraphs=True, **flags)
-
-    return run
+on_gpus = pytest.mark.parametrize("device", GPUS, indirect=True)
 
 
-def close(a, b, device):
+def close(a, b):
+    """Equal on the pretended GPU, near on a real one."""
+    is_exact = isinstance(torch.zeros(0, device="cuda"), GpuTensor)
     if isinstance(a, dict):
         assert a.keys() == b.keys()
-        return all(close(a[k], b[k], device) for k in a)
+        return all(close(a[k], b[k]) for k in a)
     if isinstance(a, torch.Tensor):
-        return torch.equal(a, b) if device.type == "cpu" else torch.allclose(a, b, rtol=1e-3, atol=1e-5)
-    return a == b or device.type == "cuda" and math.isclose(a, b, rel_tol=1e-2, abs_tol=1e-3)
+        return torch.equal(a, b) if is_exact else torch.allclose(a, b, rtol=1e-3, atol=1e-5)
+    return a == b or not is_exact and math.isclose(a, b, rel_tol=1e-2, abs_tol=1e-3)
 
 
 FLAGS = [
@@ -57,25 +53,27 @@ FLAGS = [
 ]
 
 
+@on_gpus
 @pytest.mark.parametrize("flags", FLAGS, ids=["kl-stop", "others", "every-float"])
-def test_equals_step_by_step(train, with_graphs, script, device, flags):
+def test_equals_step_by_step(train, script, flags):
     if script is ppo_rgb:
         flags = flags | dict(random_shift=2, obs_mode="rgb+depth+segmentation", update_epochs=2)
-    (rows, last), (graph_rows, graph_last) = train(cudagraphs=False, **flags), with_graphs(**flags)
-    assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
-    assert close(last["agent"], graph_last["agent"], device)
+    (rows, last), (graph_rows, graph_last) = train(cudagraphs=False, **flags), train(cudagraphs=True, **flags)
+    assert all(close(a, b) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
+    assert close(last["agent"], graph_last["agent"])
 
 
-def test_equals_step_by_step_after_a_resume(train, with_graphs, small, device):
+@on_gpus
+def test_equals_step_by_step_after_a_resume(train, small):
     """A resumed run loads the optimizer's tensors before it captures anything."""
     size, results = small.num_envs * small.num_steps, []
-    for i, run in enumerate((train, with_graphs)):
-        flags = dict(eval_freq=0, anneal_lr=True, **{} if run is with_graphs else dict(cudagraphs=False))
-        run(total_timesteps=4 * size, **flags)
-        results.append(run(resume=f"runs/run{i + 1}", total_timesteps=8 * size, **flags))
+    for i, cudagraphs in enumerate((False, True)):
+        flags = dict(eval_freq=0, anneal_lr=True, cudagraphs=cudagraphs)
+        train(total_timesteps=4 * size, **flags)
+        results.append(train(resume=f"runs/run{i + 1}", total_timesteps=8 * size, **flags))
     (rows, last), (graph_rows, graph_last) = results
-    assert all(close(a, b, device) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
-    assert close(last["agent"], graph_last["agent"], device)
+    assert all(close(a, b) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
+    assert close(last["agent"], graph_last["agent"])
 
 
 @pytest.mark.slow
@@ -101,8 +99,8 @@ def capture(script, function):
     return script.CudaGraph(function, SMALL, torch.device("cuda"))
 
 
-@pytest.mark.gpu
-def test_functions_are_captured_at_the_fourth_call(script, capsys):
+@on_gpus
+def test_functions_are_captured_at_the_fourth_call(script, device, capsys):
     calls = []
     launch = capture(script, lambda: calls.append(0))
     for _ in range(6):
@@ -110,8 +108,8 @@ def test_functions_are_captured_at_the_fourth_call(script, capsys):
     assert len(calls) == 4 and not capsys.readouterr().out
 
 
-@pytest.mark.gpu
-def test_an_observation_lies_where_the_graph_finds_it(script):
+@on_gpus
+def test_an_observation_lies_where_the_graph_finds_it(script, device):
     """Every call copies the observation to the same place. The function itself is not called after the capture."""
     seen = []
 
@@ -150,71 +148,128 @@ def test_what_cannot_be_captured_ends_the_run_in_one_line(script):
     assert process.returncode == 1 and message in process.stderr
 
 
-class Guard:
-    """While `on`, the host must not read a number from a tensor."""
-
-    LOOKS = ("item", "tolist", "__bool__", "__int__", "__float__", "__index__", "cpu", "numpy", "nonzero")
-
-    def __init__(self, monkeypatch, device):
-        self.on, self.cuda, self.count = False, device.type == "cuda", 0
-        for name in self.LOOKS:
-            monkeypatch.setattr(torch.Tensor, name, self.guarded(name, getattr(torch.Tensor, name)))
-
-    def guarded(self, name, method):
-        def look(*args, **kwargs):
-            assert not self.on, f"the host reads a number: {name}"
-            self.count += 1
-            return method(*args, **kwargs)
-
-        return look
-
-    def set(self, on):
-        self.on = on
-        if self.cuda:
-            torch.cuda.set_sync_debug_mode("error" if on else "default")
-
-
-def test_the_host_looks_at_nothing_in_rollout_and_update(train, script, device, monkeypatch):
+@on_gpus
+def test_the_host_waits_for_nothing_in_rollout_and_update(train, script, device, monkeypatch):
     """The host reads no number from the first step of the policy to the end of the rollout, or in an epoch of the
     update. The environments' step is an exception: ManiSkillVectorEnv asks whether an episode ended. Between rollouts
     and epochs the host may read numbers."""
-    guard = Guard(monkeypatch, device)
-    step, rollout = script.ManiSkillVectorEnv.step, script.rollout
-    guarded_calls = []
+    mode, calls = torch.cuda.set_sync_debug_mode, Counter()
 
-    def unguarded_step(self, actions):
-        was_on = guard.on  # off in evaluations
-        guard.set(False)
-        try:
-            return step(self, actions)
-        finally:
-            guard.set(was_on)
-
-    def guarded_rollout(*arguments):
-        try:
-            return rollout(*arguments)
-        finally:
-            assert guard.on
-            guard.set(False)
-
-    class Guarded:
-        def __init__(self, function, args, device):
-            self.function = function
-
-        def __call__(self, *obs):
-            guard.set(True)
+    def with_mode(name, function, after):
+        def run(*arguments):
+            mode("default" if name == "step" else "error")
+            calls[name] += 1
             try:
-                return self.function(*obs)
+                return function(*arguments)
             finally:
-                guard.set(self.function.__name__ == "get_action_and_value")  # the rollout goes on
-                guarded_calls.append(self.function.__name__)
+                mode(after)
 
-        def close(self):
-            pass
+        return run
 
-    monkeypatch.setattr(script.ManiSkillVectorEnv, "step", unguarded_step)
+    def no_waits(function, args, device):
+        is_epoch = function.__name__ == "update_epoch"
+        function = with_mode(function.__name__, function, "default" if is_epoch else "error")  # the rollout goes on
+        function.close = lambda: None
+        return function
+
+    rollout, step = script.rollout, script.ManiSkillVectorEnv.step
+
+    def guarded_rollout(agent, envs, *arguments):
+        monkeypatch.setattr(envs, "step", with_mode("step", partial(step, envs), "error"))
+        return with_mode("rollout", rollout, "default")(agent, envs, *arguments)
+
     monkeypatch.setattr(script, "rollout", guarded_rollout)
-    monkeypatch.setattr(script, "CudaGraph", Guarded)
+    monkeypatch.setattr(script, "CudaGraph", no_waits)
     train(norm_obs=True)
-    assert guarded_calls.count("get_action_and_value") == 40
-    assert guarded_calls.count("update_epoch") >= 4 and guard.count > 0
+    assert calls == dict(rollout=4, step=40, get_action_and_value=40, update_epoch=calls["update_epoch"])
+    assert calls["update_epoch"] >= 4
+
+
+def count_waits(train, num_iterations, size, **flags):
+    """What made the host wait in a run without evaluations in between."""
+    PretendedGpu.waits.clear()
+    train(total_timesteps=num_iterations * size, eval_freq=0, **flags)
+    return Counter(PretendedGpu.waits)
+
+
+@pytest.mark.parametrize("device", ["pretended"], indirect=True)
+def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
+    """An iteration waits as often, whatever its number of steps and minibatches. target_kl waits once an epoch."""
+    step = script.ManiSkillVectorEnv.step
+
+    def step_without_counting(envs, actions):  # ManiSkill's own waits
+        waits = len(PretendedGpu.waits)
+        result = step(envs, actions)
+        del PretendedGpu.waits[waits:]
+        return result
+
+    monkeypatch.setattr(script.ManiSkillVectorEnv, "step", step_without_counting)
+    an_iteration = []
+    for num_steps, num_minibatches, target_kl in ((4, 2, None), (8, 4, None), (4, 2, 1e9)):
+        flags = dict(num_steps=num_steps, num_minibatches=num_minibatches, target_kl=target_kl, update_epochs=3)
+        counts = [count_waits(train, n, small.num_envs * num_steps, **flags) for n in (6, 7)]
+        an_iteration.append(counts[1] - counts[0])
+    assert an_iteration[0] == an_iteration[1]
+    assert (an_iteration[2] - an_iteration[0]) == Counter(__bool__=3)
+    del an_iteration[0]["to"]  # the checkpoint: a copy of each tensor
+    assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1)
+
+
+def put_on_cpu(*names):
+    """A fault: these tensors of the agent stay on the CPU."""
+
+    def plant(script, monkeypatch):
+        to = script.Agent.to
+
+        def move(agent, device):
+            agent = to(agent, device)
+            for name in names:
+                setattr(agent, name, getattr(agent, name).cpu())
+            return agent
+
+        monkeypatch.setattr(script.Agent, "to", move)
+
+    return plant
+
+
+def after(name, fault):
+    """A fault in what a function of the script returns."""
+
+    def plant(script, monkeypatch):
+        function = getattr(script, name)
+        monkeypatch.setattr(script, name, lambda *args, **kwargs: fault(function(*args, **kwargs)))
+
+    return plant
+
+
+@on_gpus
+def test_learning_rates_lie_where_a_graph_reads_them(script, small, device):
+    """A graph would freeze a number on the CPU. Nothing else would find that, because CUDA accepts it."""
+    agent = nn.ModuleDict(dict(actor=nn.Linear(1, 1), critic=nn.Linear(1, 1)))
+    agent.actor_logstd = nn.Parameter(torch.zeros(1))
+    optimizer = script.make_optimizer(agent.to(device), small, device)
+    assert all(group["lr"].is_cuda for group in optimizer.param_groups)
+
+
+OTHER_DEVICE, WAITS = "Expected all tensors to be on the same device", "cannot be a CUDA graph"
+FAULTS = {
+    "statistics": (put_on_cpu("obs_mean"), OTHER_DEVICE),
+    "bounds": (put_on_cpu("action_low"), OTHER_DEVICE),
+    "advantages": (after("compute_gae", lambda x: (x[0] + torch.zeros(x[0].shape), x[1])), OTHER_DEVICE),
+    "loss": (after("update_minibatch", lambda x: x * torch.ones(6)), OTHER_DEVICE),
+    "detour": (after("update_minibatch", lambda x: x.cpu().to(x.device)), WAITS),
+    "number": (after("update_minibatch", lambda x: x * x[0].item()), WAITS),
+    "branch": (after("update_minibatch", lambda x: x if x[0] > 0 else -x), WAITS),
+    "mask": (after("update_minibatch", lambda x: x[x < 1e9]), WAITS),
+    "constant": (after("update_minibatch", lambda x: x * torch.tensor([1.0] * 6, device=x.device)), WAITS),
+    "check of arguments": (after("update_minibatch", lambda x: Normal(x, x.exp()).mean), WAITS),
+}
+
+
+@pytest.mark.parametrize("device", ["pretended"], indirect=True)
+@pytest.mark.parametrize("plant, message", FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize("script", [ppo])
+def test_planted_faults_are_found(train, device, script, monkeypatch, plant, message):
+    plant(script, monkeypatch)
+    with pytest.raises(RuntimeError, match=message):
+        train(cudagraphs=True, norm_obs=True)

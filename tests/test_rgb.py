@@ -236,6 +236,7 @@ def test_memory_format_changes_speed_alone(device):
     torch.testing.assert_close(*values, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)], indirect=True)
 def test_mixed_precision_is_near(device):
     envs = batched_env.make_envs(SMALL_IMAGES, 16, 0, device=device)
     obs, _ = envs.reset(seed=list(range(16)))
@@ -286,7 +287,7 @@ def test_learns_from_images(train):
     The goal region is less than two pixels wide, and the mean action often stops just next to it. Over 32 evaluation
     episodes, another number of threads, and so other rounding, changes the success rate by 0.1. Training's rate is
     over hundreds of episodes."""
-    flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6)
+    flags = dict(total_timesteps=24_000, eval_freq=0, learning_rate=1e-3, update_epochs=6, cudagraphs=True)
     metrics, _ = train(num_steps=25, num_envs=32, num_eval_episodes=32, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
     assert first["success_once"] < 0.1 and last["success_once"] >= 0.4

@@ -371,7 +371,7 @@ FINITE_HORIZON = dict(finite_horizon_gae=True, clip_vloss=True, target_kl=None)
 )
 def test_learns(train, flags, seed):
     size = dict(num_envs=128, total_timesteps=40_000, eval_freq=0)
-    metrics, _ = train(seed=seed, learning_rate=1e-3, update_epochs=8, **size, **flags)
+    metrics, _ = train(seed=seed, learning_rate=1e-3, update_epochs=8, cudagraphs=True, **size, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
     assert first["success_once"] < 0.2
     assert last["success_once"] >= 0.95 and last["num_episodes"] == 24
