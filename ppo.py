@@ -57,7 +57,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, NoReturn, Optional
 
-warnings.filterwarnings("ignore", message="Failed to find system libvulkan|CUDA reports that|.*Box .*precision")
+EXPECTED = "Failed to find system libvulkan|CUDA reports that|.*Box .*precision|.*constructed with capturable=True"
+warnings.filterwarnings("ignore", message=EXPECTED)
 
 import filelock
 import gymnasium as gym
@@ -920,7 +921,7 @@ def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     reset_error = find_reset_error(envs)
     if args.partial_reset and reset_error and {"success", "fail"} & envs.reset()[1].keys():
         fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
-             f"resets all together; --num_actors {args.num_envs} gives each its own process")  # fmt: skip
+             f"resets all; --sim_backend physx_cpu --num_actors {args.num_envs} gives each a process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
     if limit and args.gamma < 1 and not limit / 25 <= 1 / (1 - args.gamma) <= 10 * limit:
         ahead, better = 1 / (1 - args.gamma), 1 - 10 / max(limit, 20)
@@ -1686,6 +1687,8 @@ class CudaGraph:
             try:  # other threads, such as NCCL's, go on
                 with torch.cuda.graph(self.graph, stream=self.stream, capture_error_mode="thread_local"):
                     self.result = self.function(*self.obs)
+            except torch.OutOfMemoryError:
+                raise
             except RuntimeError as error:
                 name = self.function.__name__
                 raise RunError(f"{name} cannot be a CUDA graph, --no-cudagraphs does without: {error}") from None
@@ -1961,6 +1964,8 @@ def main(argv: list[str]) -> int:
         code = 128 + interrupt.args[0]
         print(f"{SCRIPT.name}: stopped by {signal.Signals(interrupt.args[0]).name}", file=sys.stderr)
     except Exception as error:
+        if isinstance(error, torch.OutOfMemoryError):
+            error = RunError("the GPU's memory is full: try fewer --num_envs or more --num_minibatches")
         code, is_expected = 1, isinstance(error, RunError) or isinstance(error, OSError) and is_from_packages(error)
         if is_expected and not os.path.exists(run_dir / "metrics.jsonl"):  # nothing was learned yet: bad input
             fail(str(error))

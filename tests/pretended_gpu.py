@@ -202,6 +202,7 @@ TORCH_CUDA = SimpleNamespace(
     set_device=lambda device: None, synchronize=lambda *device: None, get_device_name=lambda *device: "a pretended GPU",
     mem_get_info=lambda *device: (2**34, 2**34), manual_seed=lambda seed: None, manual_seed_all=lambda seed: None,
     get_rng_state=lambda *device: None, set_rng_state=lambda *state: None,  # it draws from the CPU's generator
+    is_current_stream_capturing=lambda: PretendedGpu.refused is not None,
     set_sync_debug_mode=set_sync_debug_mode, Stream=Stream, current_stream=Stream,
     stream=lambda stream: contextlib.nullcontext(), CUDAGraph=Recording, graph=capture,
 )  # fmt: skip

@@ -192,6 +192,28 @@ def count_waits(train, num_iterations, size, **flags):
     return Counter(PretendedGpu.waits)
 
 
+@on_gpus
+def test_full_memory_ends_the_run_in_one_line(script, device, in_tmp, monkeypatch, capsys):
+    """The line says what to reduce, also if the memory is full during a capture."""
+
+    def fill():
+        if launch.num_calls == 4:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    launch = capture(script, fill)
+
+    def train(args, closing):
+        (in_tmp / "runs/x").mkdir(parents=True)
+        (in_tmp / "runs/x/metrics.jsonl").touch()
+        for _ in range(4):
+            launch()
+
+    monkeypatch.setattr(script, "train", train)
+    assert script.main(["--no-cuda", "--exp_name", "x", "--num_envs", "2", "--num_actors", "1"]) == 1
+    message = "the GPU's memory is full: try fewer --num_envs or more --num_minibatches"
+    assert capsys.readouterr().err == f"{script.SCRIPT.name}: {message}\n"
+
+
 @pytest.mark.parametrize("device", ["pretended"], indirect=True)
 def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
     """An iteration waits as often, whatever its number of steps and minibatches. target_kl waits once an epoch."""
