@@ -78,7 +78,8 @@ def pytest_runtest_setup(item):
             (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a Vulkan device")
 
 
-GPUS = ["pretended", pytest.param("cuda", marks=pytest.mark.gpu)]
+CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+CPU_AND_CUDA, GPUS = ["cpu", CUDA], ["pretended", CUDA]
 
 
 @pytest.fixture(params=["cpu", *GPUS])

@@ -13,7 +13,7 @@ import pytest
 import test_rgb
 import torch
 import torch.nn as nn
-from conftest import GPUS, ROOT, SMALL, without_clock
+from conftest import CPU_AND_CUDA, GPUS, ROOT, SMALL, without_clock
 from pretended_gpu import GpuTensor, PretendedGpu
 from torch.distributions import Normal
 
@@ -77,8 +77,9 @@ def test_equals_step_by_step_after_a_resume(train, small):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
 @pytest.mark.parametrize("script", [ppo])
-def test_compiled_is_near(train, script, monkeypatch):
+def test_compiled_is_near(train, script, device, monkeypatch):
     """The compiled network is near the original in every minibatch. It draws the noise of actions from another
     generator, so the runs differ."""
     update, compared = script.update_minibatch, []
