@@ -127,11 +127,9 @@ def call(func, args: tuple, kwargs: dict):
         if func in (Tensor.numpy, Tensor.__array__):
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
         check_devices(func, args, on_gpu, on_cpu)
-        has_mask = name in ("__getitem__", "__setitem__") and any(
-            x.dtype == torch.bool and x.ndim > 0 for x in tree_leaves(args[1]) if isinstance(x, Tensor)
-        )
+        has_mask = name == "__getitem__" and any(x.dtype == torch.bool and x.ndim > 0 for x in tensors[1:])
         crosses = bool(on_gpu) and not result_on_gpu or any(x.ndim > 0 or func in COPIES for x in on_cpu)
-        if func in READS or crosses or has_mask and name == "__getitem__" or func in MAKES and not on_gpu:
+        if func in READS or crosses or has_mask or func in MAKES and not on_gpu:
             wait(func)
         if func is Tensor.to:
             result = convert(args[0], args[1:], kwargs, device)
