@@ -2,8 +2,8 @@
 
 It refuses what CUDA refuses: tensors of different devices and, while a graph is captured, whatever makes the host wait.
 A captured graph repeats the recorded operations on the same memory, without calling the function: Python numbers keep
-their recorded values. It cannot see kernels, dtypes that CUDA lacks, mixed precision, torch.compile, streams, allocation,
-PhysX and rendering."""
+their recorded values. It cannot see kernels, dtypes that CUDA lacks, mixed precision, torch.compile, streams,
+allocation, PhysX and rendering."""
 
 import contextlib
 from types import SimpleNamespace
