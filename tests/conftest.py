@@ -82,7 +82,7 @@ CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
 CPU_AND_CUDA, GPUS = ["cpu", CUDA], ["pretended", CUDA]
 
 
-@pytest.fixture(params=["cpu", *GPUS])
+@pytest.fixture(params=["cpu", pytest.param("pretended", marks=pytest.mark.slow), CUDA])
 def device(request, monkeypatch):
     if request.param == "pretended":
         with pretended_gpu(monkeypatch):

@@ -215,6 +215,7 @@ def test_full_memory_ends_the_run_in_one_line(script, device, in_tmp, monkeypatc
     assert capsys.readouterr().err == f"{script.SCRIPT.name}: {message}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["pretended"], indirect=True)
 def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
     """An iteration waits as often, whatever its number of steps and minibatches. target_kl waits once an epoch."""

@@ -44,11 +44,14 @@ def train_task(device, in_tmp, monkeypatch):
     return run
 
 
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize(
+    "env_id", ["PushCube-v1", *(pytest.param(x, marks=pytest.mark.slow) for x in TASKS if x != "PushCube-v1")]
+)
 def test_tasks_train(train_task, env_id):
     train_task(ppo, env_id)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 @pytest.mark.parametrize("env_id", ["MS-CartpoleBalance-v1", "PushCube-v1"])
 def test_images_train(train_task, env_id):
