@@ -171,6 +171,9 @@ class Stream:
     def wait_stream(self, other) -> None:
         pass
 
+    def is_capturing(self) -> bool:
+        return PretendedGpu.refused is not None
+
 
 @contextlib.contextmanager
 def capture(graph: Recording, **options):
@@ -200,17 +203,21 @@ TORCH_CUDA = SimpleNamespace(
     set_device=lambda device: None, synchronize=lambda *device: None, get_device_name=lambda *device: "a pretended GPU",
     mem_get_info=lambda *device: (2**34, 2**34), manual_seed=lambda seed: None, manual_seed_all=lambda seed: None,
     get_rng_state=lambda *device: None, set_rng_state=lambda *state: None,  # it draws from the CPU's generator
-    is_current_stream_capturing=lambda: PretendedGpu.refused is not None,
-    set_sync_debug_mode=set_sync_debug_mode, Stream=Stream, current_stream=Stream,
+    is_current_stream_capturing=lambda: Stream().is_capturing(), set_sync_debug_mode=set_sync_debug_mode,
+    Stream=Stream, current_stream=Stream,
     stream=lambda stream: contextlib.nullcontext(), CUDAGraph=Recording, graph=capture,
 )  # fmt: skip
+
+
+TORCH_ACCELERATOR = SimpleNamespace(current_accelerator=lambda check_available=False: CUDA, current_stream=Stream)
 
 
 @contextlib.contextmanager
 def pretended_gpu(monkeypatch):
     with monkeypatch.context() as patch, PretendedGpu():
-        for name, pretended in vars(TORCH_CUDA).items():
-            patch.setattr(torch.cuda, name, pretended)
+        for module, pretended in ((torch.cuda, TORCH_CUDA), (torch.accelerator, TORCH_ACCELERATOR)):
+            for name, value in vars(pretended).items():
+                patch.setattr(module, name, value)
         patch.setattr(torch._C, "_group_tensors_by_device_and_dtype", group_by_device)
         PretendedGpu.waits, PretendedGpu.refused = [], None
         yield

@@ -194,6 +194,7 @@ def count_waits(train, num_iterations, size, **flags):
 
 
 @on_gpus
+@pytest.mark.parametrize("script", [ppo])
 def test_full_memory_ends_the_run_in_one_line(script, device, in_tmp, monkeypatch, capsys):
     """The line says what to reduce, also if the memory is full during a capture."""
 

@@ -281,7 +281,8 @@ def test_all_options_train(train):
 
 
 @pytest.mark.slow
-def test_learns_from_images(train):
+@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+def test_learns_from_images(train, device):
     """The policy learns to reach a goal that only the images show.
 
     The goal region is less than two pixels wide, and the mean action often stops just next to it. Over 32 evaluation
