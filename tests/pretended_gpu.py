@@ -14,6 +14,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+aten = torch.ops.aten
 CUDA = torch.device("cuda:0")
 READS = {  # the host waits for what they return
     Tensor.item, Tensor.tolist, Tensor.cpu, Tensor.__bool__, Tensor.__int__, Tensor.__float__, Tensor.__index__,
@@ -21,6 +22,9 @@ READS = {  # the host waits for what they return
     Tensor.argwhere, Tensor.equal, Tensor.allclose, Tensor.unique, Tensor.masked_select, Tensor.bincount,
     torch.nonzero, torch.argwhere, torch.equal, torch.allclose, torch.unique, torch.masked_select, torch.bincount,
     torch.is_nonzero, torch.repeat_interleave,
+}  # fmt: skip
+READS_WITHIN = {  # the same, in what torch's functions call
+    aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default,
 }  # fmt: skip
 COPIES = {Tensor.copy_, Tensor.to, Tensor.cpu, Tensor.cuda, Tensor.type}  # between devices
 MAKES = {torch.tensor, torch.as_tensor, torch.from_numpy}  # from numbers that the host has
@@ -104,7 +108,7 @@ def check_devices(func, args: tuple, on_gpu: list, on_cpu: list) -> None:
 
 
 def convert(x: Tensor, args: tuple, kwargs: dict, device) -> Tensor:
-    """Tensor.to: the tensor itself if it has that device and dtype already, else a copy."""
+    """What Tensor.to returns: the same memory if it has that device and dtype already, else a copy."""
     options = {k: v for k, v in kwargs.items() if k in ("dtype", "memory_format")}
     dtypes = [a.dtype if isinstance(a, Tensor) else a for a in args if isinstance(a, (Tensor, torch.dtype))]
     options |= dict(dtype=dtypes[0]) if dtypes else {}
@@ -131,10 +135,8 @@ def call(func, args: tuple, kwargs: dict):
         crosses = bool(on_gpu) and not result_on_gpu or any(x.ndim > 0 or func in COPIES for x in on_cpu)
         if func in READS or crosses or has_mask or func in MAKES and not on_gpu:
             wait(func)
-        if func is Tensor.to:
+        if func in (Tensor.to, Tensor.cuda, Tensor.cpu):
             result = convert(args[0], args[1:], kwargs, device)
-        elif func in (Tensor.cuda, Tensor.cpu):
-            result = to_cpu(args[0]).clone() if crosses else args[0]
         else:
             result = func(*args, **(kwargs | dict(device="cpu") if device else kwargs))
         if not result_on_gpu:
@@ -150,6 +152,8 @@ class Recording(TorchDispatchMode):
         self.tape, self.num_replays = [], 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func in READS_WITHIN:
+            wait(func)
         result = func(*args, **(kwargs or {}))
         self.tape.append((func, args, kwargs or {}, result))
         return result
@@ -207,8 +211,6 @@ TORCH_CUDA = SimpleNamespace(
     Stream=Stream, current_stream=Stream,
     stream=lambda stream: contextlib.nullcontext(), CUDAGraph=Recording, graph=capture,
 )  # fmt: skip
-
-
 TORCH_ACCELERATOR = SimpleNamespace(current_accelerator=lambda check_available=False: CUDA, current_stream=Stream)
 
 

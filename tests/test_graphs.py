@@ -16,6 +16,7 @@ import torch.nn as nn
 from conftest import CPU_AND_CUDA, GPUS, ROOT, SMALL, without_clock
 from pretended_gpu import GpuTensor, PretendedGpu
 from torch.distributions import Normal
+from torch.nn.functional import one_hot
 
 import ppo
 import ppo_rgb
@@ -150,6 +151,38 @@ def test_what_cannot_be_captured_ends_the_run_in_one_line(script):
 
 
 @on_gpus
+@pytest.mark.parametrize("script", [ppo])
+def test_full_memory_ends_the_run_in_one_line(script, device, in_tmp, monkeypatch, capsys):
+    """The line says what to reduce, also if the memory is full during a capture."""
+
+    def fill():
+        if launch.num_calls == 4:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    launch = capture(script, fill)
+
+    def train(args, closing):
+        (in_tmp / "runs/x").mkdir(parents=True)
+        (in_tmp / "runs/x/metrics.jsonl").touch()
+        for _ in range(4):
+            launch()
+
+    monkeypatch.setattr(script, "train", train)
+    assert script.main(["--no-cuda", "--exp_name", "x", "--num_envs", "2", "--num_actors", "1"]) == 1
+    message = "the GPU's memory is full: try fewer --num_envs or more --num_minibatches"
+    assert capsys.readouterr().err == f"{script.SCRIPT.name}: {message}\n"
+
+
+@on_gpus
+def test_learning_rates_lie_where_a_graph_reads_them(script, small, device):
+    """A graph would freeze a number on the CPU. Nothing else would find that, because CUDA accepts it."""
+    agent = nn.ModuleDict(dict(actor=nn.Linear(1, 1), critic=nn.Linear(1, 1)))
+    agent.actor_logstd = nn.Parameter(torch.zeros(1))
+    optimizer = script.make_optimizer(agent.to(device), small, device)
+    assert all(group["lr"].is_cuda for group in optimizer.param_groups)
+
+
+@on_gpus
 def test_the_host_waits_for_nothing_in_rollout_and_update(train, script, device, monkeypatch):
     """The host reads no number from the first step of the policy to the end of the rollout, or in an epoch of the
     update. The environments' step is an exception: ManiSkillVectorEnv asks whether an episode ended. Between rollouts
@@ -184,6 +217,10 @@ def test_the_host_waits_for_nothing_in_rollout_and_update(train, script, device,
     train(norm_obs=True)
     assert calls == dict(rollout=4, step=40, get_action_and_value=40, update_epoch=calls["update_epoch"])
     assert calls["update_epoch"] >= 4
+    mode("error")
+    with pytest.raises(RuntimeError):
+        torch.ones(1, device=device).item()
+    mode("default")
 
 
 def count_waits(train, num_iterations, size, **flags):
@@ -191,29 +228,6 @@ def count_waits(train, num_iterations, size, **flags):
     PretendedGpu.waits.clear()
     train(total_timesteps=num_iterations * size, eval_freq=0, **flags)
     return Counter(PretendedGpu.waits)
-
-
-@on_gpus
-@pytest.mark.parametrize("script", [ppo])
-def test_full_memory_ends_the_run_in_one_line(script, device, in_tmp, monkeypatch, capsys):
-    """The line says what to reduce, also if the memory is full during a capture."""
-
-    def fill():
-        if launch.num_calls == 4:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
-
-    launch = capture(script, fill)
-
-    def train(args, closing):
-        (in_tmp / "runs/x").mkdir(parents=True)
-        (in_tmp / "runs/x/metrics.jsonl").touch()
-        for _ in range(4):
-            launch()
-
-    monkeypatch.setattr(script, "train", train)
-    assert script.main(["--no-cuda", "--exp_name", "x", "--num_envs", "2", "--num_actors", "1"]) == 1
-    message = "the GPU's memory is full: try fewer --num_envs or more --num_minibatches"
-    assert capsys.readouterr().err == f"{script.SCRIPT.name}: {message}\n"
 
 
 @pytest.mark.slow
@@ -240,16 +254,15 @@ def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
     assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1)
 
 
-def put_on_cpu(*names):
-    """A fault: these tensors of the agent stay on the CPU."""
+def put_on_cpu(name):
+    """A fault: this tensor of the agent stays on the CPU."""
 
     def plant(script, monkeypatch):
         to = script.Agent.to
 
         def move(agent, device):
             agent = to(agent, device)
-            for name in names:
-                setattr(agent, name, getattr(agent, name).cpu())
+            setattr(agent, name, getattr(agent, name).cpu())
             return agent
 
         monkeypatch.setattr(script.Agent, "to", move)
@@ -267,15 +280,6 @@ def after(name, fault):
     return plant
 
 
-@on_gpus
-def test_learning_rates_lie_where_a_graph_reads_them(script, small, device):
-    """A graph would freeze a number on the CPU. Nothing else would find that, because CUDA accepts it."""
-    agent = nn.ModuleDict(dict(actor=nn.Linear(1, 1), critic=nn.Linear(1, 1)))
-    agent.actor_logstd = nn.Parameter(torch.zeros(1))
-    optimizer = script.make_optimizer(agent.to(device), small, device)
-    assert all(group["lr"].is_cuda for group in optimizer.param_groups)
-
-
 OTHER_DEVICE, WAITS = "Expected all tensors to be on the same device", "cannot be a CUDA graph"
 FAULTS = {
     "statistics": (put_on_cpu("obs_mean"), OTHER_DEVICE),
@@ -284,6 +288,7 @@ FAULTS = {
     "loss": (after("update_minibatch", lambda x: x * torch.ones(6)), OTHER_DEVICE),
     "detour": (after("update_minibatch", lambda x: x.cpu().to(x.device)), WAITS),
     "number": (after("update_minibatch", lambda x: x * x[0].item()), WAITS),
+    "within a function of torch": (after("update_minibatch", lambda x: x * one_hot(x.long().clamp(0, 5)).sum()), WAITS),
     "branch": (after("update_minibatch", lambda x: x if x[0] > 0 else -x), WAITS),
     "mask": (after("update_minibatch", lambda x: x[x < 1e9]), WAITS),
     "constant": (after("update_minibatch", lambda x: x * torch.tensor([1.0] * 6, device=x.device)), WAITS),
