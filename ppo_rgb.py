@@ -430,9 +430,6 @@ class GoOnAfterSuccess(gym.Wrapper):
 def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
     """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
     modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
-    render_backend = args.render_backend
-    if render_backend == "gpu" and args.sim_backend != "physx_cpu":
-        render_backend = args.sim_backend.replace("physx_cuda", "gpu")  # the GPU that simulates
     kwargs = dict(
         num_envs=num_envs,
         obs_mode=args.obs_mode,
@@ -441,7 +438,7 @@ def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = F
         reward_mode=args.reward_mode or next(m for m in ("normalized_dense", "dense", "sparse", "none") if m in modes),
         reconfiguration_freq=0 if evaluation else args.reconfiguration_freq,  # `evaluate` rebuilds its scenes itself
         sim_backend=args.sim_backend,
-        render_backend=render_backend,
+        render_backend=args.render_backend,
         render_mode=args.render_mode if film else None,
     )
     kwargs = {k: v for k, v in kwargs.items() if v is not None} | json.loads(args.env_kwargs)
@@ -785,6 +782,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
     first_iteration, global_step = resumed.get("iteration", 0), resumed.get("global_step", 0)
     torch.set_num_threads(1)  # idle threads would spin on cores that the simulation needs
 
+    film = Film(local, run_dir, closing)
     actors = Actors(local, run_dir / "videos", closing)
     seed_all(args.seed)  # the same weights, whatever the environments drew
     agent = make_agent(*actors.spaces, args, loaded).to(device)
@@ -814,7 +812,6 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
     closing.callback(logger.close)
     checkpoints = Checkpoints(args, run_dir, resumed, agent, optimizer, actors.spaces[0], logger)
     closing.callback(checkpoints.close)
-    film = Film(local, run_dir, closing)
 
     for iteration in range(first_iteration, args.num_iterations + 1):  # the number of finished updates
         # --- checkpoint: a run that ends in this iteration, for whatever reason, can be resumed from here ---
@@ -950,8 +947,10 @@ def episode_metrics(info: dict) -> dict[str, torch.Tensor]:
 
 def add_episodes(sums: dict, info: dict, done: torch.Tensor) -> None:
     """Add the metrics of the episodes that are done, and their number, to the sums."""
-    for key, value in (episode_metrics(info) | dict(num_episodes=done)).items():
-        sums[key] = sums.get(key, 0.0) + torch.where(done, value.float(), 0.0).sum()
+    metrics = episode_metrics(info) | dict(num_episodes=done)
+    totals = torch.where(done, torch.stack([value.float() for value in metrics.values()]), 0.0).sum(1)
+    for key, total in zip(metrics, totals):
+        sums[key] = sums.get(key, 0.0) + total
 
 
 def start_episodes(envs: ManiSkillVectorEnv, seeds: list[int], separately: bool):
@@ -987,11 +986,11 @@ def evaluate_checkpoint(args: Args, closing: contextlib.ExitStack) -> None:
     """--evaluate: play the episodes, print, film and write the results."""
     torch.set_num_threads(1)
     _, _, _, folder = start_processes(args, closing)
+    film = Film(args, folder, closing)
     actors = Actors(args, folder / "test_videos", closing)
     agent = make_agent(*actors.spaces, args, load_checkpoint(args.checkpoint)).to(actors.device)
     actors.distribute(agent, actors.device)
     episodes = actors.evaluate(args.eval_seed)
-    film = Film(args, folder, closing)
     if args.capture_video:
         for seed in range(args.eval_seed, args.eval_seed + 4, film.num_envs):
             film.record(agent, f"test_videos/seed_{seed}", seed)
@@ -1020,11 +1019,16 @@ def find_render_error(args: Args) -> Optional[str]:
 
 
 class Film:
-    """A small batch of its own that plays the first evaluation episodes again, into videos."""
+    """A small batch of its own that plays the first evaluation episodes again, into videos. Make it before any other
+    environment."""
 
     def __init__(self, args: Args, folder: Path, closing: contextlib.ExitStack):
         self.args, self.folder, self.closing, self.envs = args, folder, closing, None
-        self.is_off = args.render_backend == "none"
+        self.is_off = args.render_backend == "none" or not (args.capture_video or args.save_train_video_freq)
+        if not self.is_off and find_render_error(args) is None:
+            # A process renders on one device: that of the first render object, which would be a task's on any device.
+            device = parse_backends_and_find_renderer(args.sim_backend, args.render_backend).render_device
+            self.renderer = sapien.render.RenderSystem(device)
         self.num_envs = 1 if args.sim_backend == "physx_cpu" else 4
 
     def record(self, agent, name: str, seed: int, exploring: bool = False) -> None:
@@ -1136,7 +1140,10 @@ parse_backends = sapien_env.parse_sim_and_render_backend
 
 
 def parse_backends_and_find_renderer(sim_backend: str, render_backend: str):
-    """ManiSkill's render_backend has no name for a Vulkan device without CUDA: use it if CUDA cannot render."""
+    """Render on the GPU that simulates. ManiSkill has no name for a Vulkan device without CUDA: use it if CUDA cannot
+    render."""
+    if render_backend == "gpu" and sim_backend.startswith("physx_cuda"):
+        render_backend = sim_backend.replace("physx_cuda", "gpu")
     backend = parse_backends(sim_backend, render_backend)
     if RENDER_DEVICE and backend.render_device and not backend.render_device.can_render():
         backend.render_device, backend.render_backend = RENDER_DEVICE, "sapien_cpu"
@@ -1195,6 +1202,7 @@ class BatchedPhysx:
 
     def __init__(self, scenes: list[sapien.Scene], timestep: float):
         self.scenes, self.systems, self.timestep = scenes, [scene.physx_system for scene in scenes], timestep
+        self.num_steps = 0
         for scene in scenes:
             scene.batch, scene.physx_system.timestep = self, timestep
 
@@ -1246,6 +1254,7 @@ class BatchedPhysx:
         for system in self.systems:
             system.step()
         self.contacts, self.is_read = None, False
+        self.num_steps += 1
 
     def _read(self) -> None:
         """Read the state of all scenes, unless nothing has changed since."""
@@ -1380,6 +1389,7 @@ class BatchedRenderer:
 
     def __init__(self, scenes: list[sapien.Scene], cameras: tuple = ()):
         self.scenes, self.cameras = scenes, cameras
+        self.states, self.pictures = [None] * len(cameras), [{} for _ in cameras]
 
     def update_render(self) -> None:
         for scene in self.scenes:
@@ -1389,12 +1399,20 @@ class BatchedRenderer:
         return BatchedRenderer(self.scenes, cameras)
 
     def take_picture(self) -> None:
-        for camera in self.cameras:
-            camera.take_picture()
+        """A partial reset asks for pictures of all scenes: those that it left alone keep theirs."""
+        for i, camera in enumerate(self.cameras):
+            scene = camera.entity.scene
+            state = scene.batch.num_steps, scene.pack_poses()
+            if self.states[i] != state:
+                camera.take_picture()
+                self.states[i], self.pictures[i] = state, {}
 
     def get_picture_cuda(self, name: str) -> SimpleNamespace:
-        pictures = common.to_tensor(np.stack([camera.get_picture(name) for camera in self.cameras]))
-        return SimpleNamespace(torch=lambda: pictures)
+        for camera, pictures in zip(self.cameras, self.pictures):
+            if name not in pictures:
+                pictures[name] = camera.get_picture(name)
+        batch = common.to_tensor(np.stack([pictures[name] for pictures in self.pictures]))
+        return SimpleNamespace(torch=lambda: batch)
 
 
 def is_batch(scene: ManiSkillScene) -> bool:
@@ -1566,6 +1584,7 @@ def run_in_actor(method: str, *arguments):
     if method != "build":
         return getattr(ACTOR, method)(*arguments)
     torch.set_num_threads(1)
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # ManiSkill would save the random state of each GPU, and take memory there
     threading.Thread(target=end_with_main_process, daemon=True).start()
     ACTOR = Actor(*arguments)
 
@@ -1598,7 +1617,7 @@ class Actors:
         learner is on another device. Returns the learner's storage: tensors (num_steps, num_envs, ...)."""
         args, has_copies = self.args, self.device.type != device.type
         self.learner, self.agent = agent, copy.deepcopy(agent).to(self.device) if has_copies else agent
-        self.storage = {} if args.evaluate else make_storage(*self.spaces, args, self.device, device)
+        self.storage = {} if args.evaluate else make_storage(agent, *self.spaces, args, self.device)
         self.learner_storage = tree_map(lambda x: x.to(device), self.storage) if has_copies else self.storage
         if self.pools:
             for x in tree_leaves([self.agent.state_dict(), self.storage]):
@@ -1647,9 +1666,10 @@ class Actors:
             pool.shutdown()
 
 
-def make_storage(obs_space, action_space, args: Args, device: torch.device, learner_device: torch.device) -> dict:
+def make_storage(agent, obs_space, action_space, args: Args, device: torch.device) -> dict:
     """Buffers of a rollout, (num_steps, num_envs, ...) each; observations are a tensor or a dict, like their space.
     Refuses what does not fit: Linux would end the run without a word, or with 'Bus error' alone."""
+    learner_device = agent.actor_logstd.device
 
     def empty(shape=(), dtype="float32"):
         return torch.empty(args.num_steps, args.num_envs, *shape, dtype=getattr(torch, dtype), device="meta")
@@ -1659,18 +1679,38 @@ def make_storage(obs_space, action_space, args: Args, device: torch.device, lear
     storage["obs"] = tree_map(lambda space: empty(space.shape, space.dtype.name), obs_spaces)
     storage["actions"] = empty(action_space.shape)
 
-    free = {} if device.type == "cuda" else {"memory": psutil.virtual_memory().available / LOCAL_WORLD_SIZE}
+    stored = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
+    num_rows = args.batch_size // args.num_minibatches + args.num_envs  # for a gradient, and for acting
+    used = stored + num_rows * layers_size(agent, storage)
+    places = []
+    if device.type == "cpu":
+        places.append(("memory", psutil.virtual_memory().available / LOCAL_WORLD_SIZE, used))
     if args.num_actors > 1 and Path("/dev/shm").exists():
-        size = shutil.disk_usage("/dev/shm").free / LOCAL_WORLD_SIZE
-        free["shared memory (docker run --shm-size; --num_actors 1 needs none)"] = size
+        free = shutil.disk_usage("/dev/shm").free / LOCAL_WORLD_SIZE
+        places.append(("shared memory (docker run --shm-size; --num_actors 1 needs none)", free, stored))
     if learner_device.type == "cuda":
-        free["the GPU's memory"] = torch.cuda.mem_get_info(learner_device)[0]
-    needed = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
-    for place, size in free.items():
-        if needed > 0.9 * size:
-            fail(f"a rollout needs {needed / 2**20:,.0f} MiB, and {size / 2**20:,.0f} MiB of {place} are free: try "
-                 f"--num_steps {args.num_steps // 2}, fewer --num_envs or, if it has images, smaller ones")  # fmt: skip
+        places.append(("the GPU's memory", torch.cuda.mem_get_info(learner_device)[0], used))
+    for place, free, needed in places:
+        if needed > 0.9 * free:
+            remedy = f"--num_steps {args.num_steps // 2}, fewer --num_envs, more --num_minibatches or smaller images"
+            needed, free = (f"{size / 2**20:,.0f} MiB" for size in (needed, free))
+            fail(f"training needs {needed}, and {free} of {place} are free: try {remedy}")
     return tree_map(lambda x: torch.zeros_like(x, device=device), storage)
+
+
+def layers_size(agent, storage: dict) -> float:
+    """Bytes that the layers of the network keep for the gradient of one observation, measured with two."""
+    agent, sizes = copy.deepcopy(agent).cpu(), {}
+    weights = [x.untyped_storage().data_ptr() for x in agent.parameters()]
+    rows = [tree_map(lambda x: torch.zeros(2, *x.shape[2:], dtype=x.dtype), storage[k]) for k in ("obs", "actions")]
+
+    def keep(x):
+        sizes[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
+        return x
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda x: x):
+        _outputs = agent.get_action_and_value(*rows)
+    return sum(size for address, size in sizes.items() if address not in weights) / 2
 
 
 # ----- Checkpoints ----------------------------------------------------------------------------------------------------

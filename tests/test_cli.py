@@ -9,6 +9,7 @@ import subprocess
 import sys
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -348,6 +349,38 @@ def test_a_film_holds_no_more_than_two_frames(tmp_path, monkeypatch):
     with contextlib.ExitStack() as closing:
         ppo.Film(args, tmp_path, closing).record(cartpole_agent(args), "long", 0)
     assert len(frames) == 13
+
+
+@pytest.mark.parametrize("sim_backend, expected", [("physx_cuda:1", "gpu:1"), ("physx_cpu", "gpu")])
+def test_films_have_a_renderer_before_any_other_environment(tmp_path, monkeypatch, sim_backend, expected):
+    """SAPIEN renders on one device, that of the first render object of a process. The first is a renderer on the GPU
+    that simulates, not a material of a training environment on whatever device Vulkan lists first."""
+    made = []
+
+    def parse(sim_backend, render_backend):
+        return SimpleNamespace(render_device=SimpleNamespace(can_render=lambda: True, name=render_backend))
+
+    class Stop(Exception):
+        pass
+
+    def stop(*args):
+        made.append("environments")
+        raise Stop
+
+    monkeypatch.setattr(ppo, "find_render_error", lambda args: None)
+    monkeypatch.setattr(ppo, "parse_backends", parse)
+    monkeypatch.setattr(ppo.sapien.render, "RenderSystem", lambda device: made.append(device.name))
+    monkeypatch.setattr(ppo, "Actors", stop)
+    args = ppo.Args(sim_backend=sim_backend, cuda=False, exp_name=str(tmp_path / "x"))
+    monkeypatch.setattr(ppo, "choose_device", lambda args: torch.device("cpu"))
+    for run, flags in ((ppo.train, {}), (ppo.evaluate_checkpoint, {})):
+        with contextlib.ExitStack() as closing, pytest.raises(Stop):
+            run(replace(args, **flags), closing)
+    assert made == [expected, "environments"] * 2
+    with contextlib.ExitStack() as closing:
+        ppo.Film(replace(args, capture_video=False), tmp_path, closing)
+        ppo.Film(replace(args, render_backend="none"), tmp_path, closing)
+    assert len(made) == 4, "a run without films needs no renderer"
 
 
 @pytest.mark.render

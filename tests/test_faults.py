@@ -3,6 +3,7 @@ the command with real tasks."""
 
 import contextlib
 import errno
+import math
 import multiprocessing
 import os
 import re
@@ -16,6 +17,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import batched_env
 import psutil
@@ -36,8 +38,10 @@ from conftest import (
     same_weights,
     scalars,
 )
+from torch.utils._pytree import tree_leaves
 
 import ppo
+import ppo_rgb
 
 
 def signal_self():
@@ -523,6 +527,36 @@ def test_physics_that_explode_end_the_run(in_tmp, monkeypatch, capfd):
     steps = ppo.load_checkpoint("runs/x/last.pt")["global_step"] + 40
     Path("exploding.py").write_text(FRAGILE.format(name="Exploding", fault="pass", in_main_process=False))
     assert ppo.main(["--resume", "runs/x", "--total_timesteps", str(steps)]) == 0
+
+
+@pytest.mark.parametrize("encoder, num_envs", [("nature", 8), ("impala", 8), (None, 512)])
+def test_memory_that_is_too_small_is_refused(monkeypatch, capsys, encoder, num_envs):
+    """It counts what a rollout stores, and what a minibatch and the acting policy compute: at least the outputs of all
+    activation functions, added up by hooks."""
+    script = ppo_rgb if encoder else ppo
+    args = script.Args(num_envs=num_envs, num_steps=10, num_minibatches=2, num_actors=1)
+    box, action_space = ppo.gym.spaces.Box, ppo.gym.spaces.Box(-1, 1, (8,))
+    if encoder:
+        args = replace(args, encoder=encoder)
+        obs_space = ppo.gym.spaces.Dict(rgb=box(0, 255, (128, 128, 3), "uint8"), state=box(-1, 1, (30,)))
+    else:
+        obs_space = box(-1, 1, (30,))
+    agent, sizes = script.Agent(obs_space, action_space, args), []
+    for module in agent.modules():
+        if isinstance(module, (torch.nn.ReLU, torch.nn.Tanh)):
+            module.register_forward_hook(lambda module, inputs, output: sizes.append(4 * output[0].numel()))
+
+    def make_storage(free):
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=free))
+        return script.make_storage(agent, obs_space, action_space, args, torch.device("cpu"))
+
+    stored = sum(x.nbytes for x in tree_leaves(make_storage(math.inf)))
+    layers = sum(sizes) * (5 + 1) * num_envs  # rows of a minibatch and of a step
+    make_storage(free=2 * stored + 5 * layers)
+    with pytest.raises(SystemExit):
+        make_storage(free=stored + layers)
+    line = capsys.readouterr().err
+    assert re.search(r"training needs [\d,]+ MiB, and [\d,]+ MiB of memory are free: try --num_steps 5, fewer", line)
 
 
 def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, capsys):

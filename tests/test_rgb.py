@@ -103,6 +103,36 @@ def test_view():
 
 
 @pytest.mark.render
+def test_a_partial_reset_renders_what_it_resets():
+    """The others keep their pictures, to the last bit. A step renders all."""
+    env = ppo_rgb.make_env(replace(ARGS, obs_mode="rgb+segmentation"), 3)
+    before = env.reset(seed=[1, 2, 3])[0]
+    (cameras,) = env.unwrapped.scene.camera_groups.values()
+    taken = []
+
+    class Camera:
+        def __init__(self, camera, index):
+            self.camera, self.index = camera, index
+
+        def __getattr__(self, name):
+            return getattr(self.camera, name)
+
+        def take_picture(self):
+            taken.append(self.index)
+            self.camera.take_picture()
+
+    cameras.cameras = [Camera(camera, i) for i, camera in enumerate(cameras.cameras)]
+    after = env.reset(options=dict(env_idx=torch.tensor([1])))[0]
+    assert taken == [1]
+    for k in ("rgb", "segmentation"):
+        assert torch.equal(after[k][[0, 2]], before[k][[0, 2]])
+    assert not torch.equal(after["rgb"][1], before["rgb"][1])
+    env.step(torch.zeros(3, *env.get_wrapper_attr("single_action_space").shape))
+    assert taken == [1, 0, 1, 2]
+    env.close()
+
+
+@pytest.mark.render
 @pytest.mark.parametrize("env_id, robot", [("MS-CartpoleBalance-v1", None), ("PickCube-v1", "panda_wristcam")])
 def test_a_batch_sees_what_single_environments_see(env_id, robot):
     """From equal states on, both see the same, even with frame stacks and a reset of one environment. The goal is

@@ -6,8 +6,10 @@ replay computes what the storage must hold: it shares no code with ppo.py."""
 import contextlib
 import copy
 import math
+import os
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import batched_env
 import gymnasium as gym
@@ -486,7 +488,8 @@ def test_every_training_episode_ends_by_itself(num_envs, num_actors, monkeypatch
 
         actor.envs.step, actor.envs.reset = spy_step, spy_reset
         spaces, cpu = (actor.envs.single_observation_space, actor.envs.single_action_space), torch.device("cpu")
-        actor.receive(make_agent(*spaces, args), ppo.make_storage(*spaces, args, cpu, cpu))
+        agent = make_agent(*spaces, args)
+        actor.receive(agent, ppo.make_storage(agent, *spaces, args, cpu))
         assert actor.rebuild_freq == 15, "ten episodes of six steps, in iterations of four"
         counts = [actor.rollout(i, i == 0)["num_episodes"].item() for i in range(45)]
         assert sum(counts) == len(ended) and not running.any()
@@ -508,6 +511,18 @@ def test_a_copy_of_the_agent_acts_with_what_was_learned(tmp_path, monkeypatch):
                 agent.critic[-1].bias += 1
             use()
             assert torch.equal(actors.agent.critic[-1].bias, agent.critic[-1].bias)
+
+
+def test_actors_see_no_gpu(tmp_path, monkeypatch):
+    """ManiSkill saves the random state of every GPU when it resets. An actor that simulates on the CPU would take
+    memory of the GPU for that."""
+    monkeypatch.setattr(ppo, "Actor", lambda *arguments: None)
+    monkeypatch.setattr(ppo.threading, "Thread", lambda **kwargs: SimpleNamespace(start=lambda: None))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    num_threads = torch.get_num_threads()
+    ppo.run_in_actor("build", SMALL, 1, tmp_path)
+    torch.set_num_threads(num_threads)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "" and torch.cuda.device_count() == 0
 
 
 PEG = replace(TWO, env_id="PegInsertionSide-v1")
