@@ -184,25 +184,25 @@ class Args:
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"enhanced_determinism": true}'"""
     # --- PPO ---
-    total_timesteps: int = 10_000_000
-    """total number of environment steps"""
-    learning_rate: float = 3e-4
+    total_timesteps: Optional[int] = None
+    """total number of environment steps (None: NUM_ITERATIONS iterations, enough for PushCube-v1)"""
+    learning_rate: float = 1e-3
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
     """learning rate of the agent's `critic` (None: learning_rate)"""
-    logstd_lr_factor: float = 1.0
+    logstd_lr_factor: float = 20.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
-    """steps in each environment per iteration (None: 50; on a CPU 1600 / num_envs, at least 5)"""
-    anneal_lr: bool = False
+    """steps in each environment per iteration (None: GPU_BATCH_SIZE or CPU_BATCH_SIZE / num_envs, at least 5)"""
+    anneal_lr: bool = True
     """lower the learning rate linearly to zero over the run (with desired_kl: that of the critic only)"""
-    gamma: float = 0.8
+    gamma: float = 0.9
     """discount factor"""
-    gae_lambda: float = 0.9
+    gae_lambda: float = 0.8
     """lambda of generalised advantage estimation"""
-    num_minibatches: int = 32
+    num_minibatches: int = 4
     """minibatches per epoch; if they do not divide the batch, each epoch leaves out a random remainder"""
-    update_epochs: int = 4
+    update_epochs: int = 8
     """passes over the batch per iteration"""
     norm_adv: bool = True
     """normalise the advantages of each minibatch"""
@@ -216,9 +216,9 @@ class Args:
     """weight of the value loss"""
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
-    target_kl: Optional[float] = 0.1
+    target_kl: Optional[float] = None
     """stop the update after an epoch whose last minibatch has a larger KL divergence (None: never)"""
-    desired_kl: Optional[float] = None
+    desired_kl: Optional[float] = 0.1
     """adapt the policy's learning rate after each minibatch to keep the KL divergence near this (None: do not)"""
     reward_scale: float = 1.0
     """factor on the rewards that PPO learns from; logged returns are without it"""
@@ -226,7 +226,7 @@ class Args:
     """when to bootstrap from the last observation of an episode: at every end, only at time limits, or never"""
     finite_horizon_gae: bool = False
     """average the n-step returns that exist, instead of the infinite sum"""
-    norm_obs: bool = False
+    norm_obs: bool = True
     """normalise observations by their running mean and variance"""
     layer_norm: bool = False
     """normalise the hidden layers of policy and value (Ba et al. 2016, arXiv 1607.06450)"""
@@ -279,12 +279,12 @@ class Args:
         return self.total_timesteps // self.batch_size
 
 
-# On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
-CPU_DEFAULTS = dict(
-    total_timesteps=120_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=4, update_epochs=8, norm_obs=True,
-    logstd_lr_factor=20.0, target_kl=None, desired_kl=0.05, gamma=0.9, gae_lambda=0.8, eval_freq=10,
-)  # fmt: skip
-CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
+# On a CPU, steps cost more, and an iteration has fewer: too few for a larger change of the policy.
+CPU_DEFAULTS = dict(desired_kl=0.05, eval_freq=10)
+GPU_BATCH_SIZE = 4096  # steps of an iteration, unless num_steps is given
+CPU_BATCH_SIZE = 1600
+NUM_ITERATIONS = 75  # unless total_timesteps is given
+CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 512  # with more, an iteration has more steps than PPO can use
 UPDATE_THREADS_PER_CORE = 0.5  # OpenMP's threads wait for the slowest one, and stall if other work takes its core
 
 # These fix the task and the network: a resumed run cannot change them, and --checkpoint brings them along.
@@ -1815,7 +1815,7 @@ def parse_args(argv: list[str]) -> Args:
     parse = partial(tyro.cli, Args, prog=SCRIPT.name, description=description)
     given, default = parse(args=[arg for arg in argv if arg not in ("-h", "--help")]), Args()
     if choose_backend(given) == "physx_cpu":
-        num_envs = CPU_ENVS_PER_CORE * num_cores() * WORLD_SIZE
+        num_envs = min(CPU_ENVS_PER_CORE * num_cores(), MAX_CPU_ENVS // WORLD_SIZE) * WORLD_SIZE
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
@@ -1829,7 +1829,10 @@ def parse_args(argv: list[str]) -> Args:
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
-        args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+        batch_size = CPU_BATCH_SIZE if args.sim_backend == "physx_cpu" else GPU_BATCH_SIZE
+        args.num_steps = max(5, batch_size // max(1, args.num_envs))
+    if args.total_timesteps is None:
+        args.total_timesteps = NUM_ITERATIONS * args.batch_size
     if args.num_actors is None:
         cores = num_cores() * WORLD_SIZE if args.sim_backend == "physx_cpu" else WORLD_SIZE
         args.num_actors = max(1, min(cores, args.num_envs))

@@ -192,8 +192,8 @@ class Args:
     env_kwargs: str = "{}"
     """further arguments of gym.make as JSON, such as '{"sensor_configs": {"fov": 0.6}}'"""
     # --- PPO ---
-    total_timesteps: int = 10_000_000
-    """total number of environment steps"""
+    total_timesteps: Optional[int] = None
+    """total number of environment steps (None: NUM_ITERATIONS iterations, enough for PushCube-v1)"""
     learning_rate: float = 3e-4
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
@@ -201,7 +201,7 @@ class Args:
     logstd_lr_factor: float = 1.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
-    """steps in each environment per iteration (None: 50; on a CPU 1600 / num_envs, at least 5)"""
+    """steps in each environment per iteration (None: GPU_BATCH_SIZE or CPU_BATCH_SIZE / num_envs, at least 5)"""
     anneal_lr: bool = False
     """lower the learning rate linearly to zero over the run (with desired_kl: that of the critic only)"""
     gamma: float = 0.8
@@ -297,10 +297,13 @@ class Args:
 
 # On a GPU, steps are cheap and hundreds of environments run at once. On a CPU, PPO learns from each step more often.
 CPU_DEFAULTS = dict(
-    total_timesteps=250_000, learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True,
-    target_kl=0.1, eval_freq=50, num_eval_episodes=16,
+    learning_rate=1e-3, anneal_lr=True, num_minibatches=8, update_epochs=8, norm_obs=True, target_kl=0.1, eval_freq=50,
+    num_eval_episodes=16,
 )  # fmt: skip
-CPU_ENVS_PER_CORE = 32  # and the same number for evaluation
+GPU_BATCH_SIZE = 12800  # steps of an iteration, unless num_steps is given
+CPU_BATCH_SIZE = 1600
+NUM_ITERATIONS = 150  # unless total_timesteps is given
+CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 512  # with more, an iteration has more steps than PPO can use
 UPDATE_THREADS_PER_CORE = 1.0  # in ppo.py, with its small layers, half of them are faster
 TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
 
@@ -2013,7 +2016,7 @@ def parse_args(argv: list[str]) -> Args:
     parse = partial(tyro.cli, Args, prog=SCRIPT.name, description=description)
     given, default = parse(args=[arg for arg in argv if arg not in ("-h", "--help")]), Args()
     if choose_backend(given) == "physx_cpu":
-        num_envs = CPU_ENVS_PER_CORE * num_cores() * WORLD_SIZE
+        num_envs = min(CPU_ENVS_PER_CORE * num_cores(), MAX_CPU_ENVS // WORLD_SIZE) * WORLD_SIZE
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
@@ -2027,7 +2030,10 @@ def parse_args(argv: list[str]) -> Args:
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
-        args.num_steps = max(5, 1600 // max(1, args.num_envs)) if args.sim_backend == "physx_cpu" else 50
+        batch_size = CPU_BATCH_SIZE if args.sim_backend == "physx_cpu" else GPU_BATCH_SIZE
+        args.num_steps = max(5, batch_size // max(1, args.num_envs))
+    if args.total_timesteps is None:
+        args.total_timesteps = NUM_ITERATIONS * args.batch_size
     if args.num_actors is None:
         cores = num_cores() * WORLD_SIZE if args.sim_backend == "physx_cpu" else WORLD_SIZE
         args.num_actors = max(1, min(cores, args.num_envs))

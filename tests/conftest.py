@@ -97,10 +97,13 @@ def in_tmp(tmp_path, monkeypatch):
     return tmp_path
 
 
-# the defaults for a GPU with small sizes; tests that replace make_envs use only the registration of env_id
+# ManiSkill's flags with small sizes. Each test adds what it is about; those that replace make_envs use only the
+# registration of env_id.
 SMALL = ppo.Args(
     sim_backend="physx_cpu", num_envs=32, num_eval_envs=16, num_eval_episodes=24, num_actors=1, num_steps=10,
-    total_timesteps=32 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False,
+    total_timesteps=32 * 10 * 4, num_minibatches=4, eval_freq=2, capture_video=False, cuda=False, learning_rate=3e-4,
+    anneal_lr=False, gamma=0.8, gae_lambda=0.9, update_epochs=4, target_kl=0.1, desired_kl=None, norm_obs=False,
+    logstd_lr_factor=1.0,
 )  # fmt: skip
 
 

@@ -121,19 +121,37 @@ def test_commands_for_the_peers_scripts_parse(trained):
     assert (args.control_mode, args.batch_size, args.num_iterations) == ("pd_ee_delta_pose", 40960, 48)
 
 
-def test_defaults_by_backend(monkeypatch):
+@pytest.mark.parametrize(
+    "cores, num_envs, num_steps",
+    [(1, 32, 50), (2, 64, 25), (4, 128, 12), (8, 256, 6), (16, 512, 5), (32, 512, 5), (64, 512, 5)],
+)
+def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
+    """Every core simulates. With many cores, an iteration still has few steps, so that there are enough iterations."""
+    monkeypatch.setattr(ppo, "num_cores", lambda: cores)
     args = ppo.parse_args(["--no-cuda"])
-    cores = ppo.num_cores()
-    assert (args.sim_backend, args.num_envs, args.num_eval_envs) == ("physx_cpu", 32 * cores, 32 * cores)
-    assert args.num_actors == cores and args.num_steps == max(5, 1600 // args.num_envs)
-    assert args.batch_size >= args.num_minibatches and args.num_iterations > 10
+    assert (args.sim_backend, args.num_actors) == ("physx_cpu", cores)
+    assert (args.num_envs, args.num_eval_envs, args.num_steps) == (num_envs, num_envs, num_steps)
+    assert args.num_iterations == 75 and args.batch_size <= 2560 and args.desired_kl == 0.05
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
-    assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations > 10 and args.num_steps == 5
+    assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations == 75 and args.num_steps == 5
     assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
+    assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
+
+
+@pytest.mark.parametrize("num_envs, num_steps", [(512, 8), (4096, 5), (16, 256)])
+def test_defaults_of_a_gpu(monkeypatch, num_envs, num_steps):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    args = ppo.parse_args(["--num_envs", str(num_envs)])
+    assert (args.sim_backend, args.num_steps, args.num_actors) == ("physx_cuda:0", num_steps, 1)
+    assert args.num_iterations == 75 and args.exp_name.startswith("PushCube-v1__ppo__1__")
+    rest = dict(sim_backend="physx_cuda:0", num_envs=num_envs, num_steps=num_steps, num_actors=1)
+    rest |= dict(total_timesteps=args.total_timesteps, exp_name=args.exp_name)
+    assert args == replace(ppo.Args(), **rest) and ppo.parse_args([]).num_envs == 512
+
+
+def test_defaults_by_backend(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     args = ppo.parse_args([])
-    assert args.sim_backend == "physx_cuda:0" and args.exp_name.startswith("PushCube-v1__ppo__1__")
-    assert args == replace(ppo.Args(), sim_backend="physx_cuda:0", num_steps=50, num_actors=1, exp_name=args.exp_name)
     with monkeypatch.context() as patch:
         patch.setattr(ppo, "WORLD_SIZE", 2)
         patch.setattr(ppo, "LOCAL_RANK", 1)
@@ -141,7 +159,7 @@ def test_defaults_by_backend(monkeypatch):
         assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process has its own GPU"
     assert args.num_eval_envs >= args.num_eval_episodes, "an evaluation must take one round of episodes"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
-    assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 32
+    assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 4
     args = ppo.parse_args(["--sim_backend", "physx_cpu"])
     assert ppo.choose_device(args) == torch.device("cuda:0")
     args = ppo.parse_args(["--sim_backend", "physx_cpu", "--no-cuda"])

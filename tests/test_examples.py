@@ -3,6 +3,7 @@ copies of an example."""
 
 import importlib
 import json
+from dataclasses import asdict
 
 import gymnasium as gym
 import numpy as np
@@ -244,6 +245,32 @@ def test_recipes_are_commands(run_recipe, in_tmp, monkeypatch):
         module.check(args)
         assert args.seed == 3 and ("cpu" in name) == ("--no-cuda" in flags)
         assert ("images" in name) == (script == "ppo_rgb.py")
+
+
+# What ManiSkill's ppo.py and ppo_rgb.py do without flags (3.0.1), in the names of our flags.
+OF_MANISKILL = dict(
+    learning_rate=3e-4, anneal_lr=False, gamma=0.8, gae_lambda=0.9, norm_adv=True, clip_coef=0.2, clip_vloss=False,
+    ent_coef=0.0, vf_coef=0.5, max_grad_norm=0.5, reward_scale=1.0, finite_horizon_gae=False, partial_reset=True,
+    success_steps=1, desired_kl=None, logstd_lr_factor=1, norm_obs=False, layer_norm=False, logstd_init=-0.5,
+    logstd_final=None, bootstrap_at_done="always", critic_learning_rate=None,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name, differs",
+    [
+        ("push_cube_gpu", dict(num_envs=2048, update_epochs=8, num_minibatches=32, num_steps=20, target_kl=0.1)),
+        ("pick_cube_gpu", dict(num_envs=1024, update_epochs=8, num_minibatches=32, num_steps=50, target_kl=0.1)),
+        ("pick_cube_images_gpu", dict(num_envs=256, update_epochs=8, num_minibatches=8, num_steps=50, target_kl=0.2)),
+    ],
+)
+def test_recipes_of_maniskill_have_its_flags(run_recipe, monkeypatch, name, differs):
+    """Whatever our defaults are."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    (script, *flags), _ = run_recipe(name)
+    args = asdict({"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script].parse_args(flags))
+    expected = OF_MANISKILL | differs
+    assert {k: args[k] for k in expected if k in args} == {k: v for k, v in expected.items() if k in args}
 
 
 @pytest.mark.render

@@ -3,6 +3,7 @@ the command with real tasks."""
 
 import contextlib
 import errno
+import gc
 import math
 import multiprocessing
 import os
@@ -270,6 +271,7 @@ def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
             train(**RUN)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    gc.collect()  # the lock of the run's folder, which a user's process would release when it ends
     assert ppo.load_checkpoint("runs/run1/last.pt")["iteration"] == 3
     metrics, last = train(**RUN, resume="runs/run1")
     assert last["iteration"] == 12
@@ -345,7 +347,7 @@ def test_flags_of_a_resumed_run(trained, in_tmp, capsys):
 
 def test_learning_rates_of_a_resumed_run(device):
     """An adapted learning rate keeps its last value, unless its flag has changed; one that was annealed does not."""
-    args = ppo.Args(learning_rate=1e-3, desired_kl=0.01)
+    args = ppo.Args(learning_rate=1e-3, desired_kl=0.01, logstd_lr_factor=1.0)
     agent = ppo.Agent(box(4), ACTIONS, args).to(device)
     saved = ppo.make_optimizer(agent, args, device)
     ppo.adapt_learning_rate(saved, torch.tensor(1.0, device=device), 0.01)

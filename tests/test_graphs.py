@@ -270,12 +270,13 @@ def put_on_cpu(name):
     return plant
 
 
-def after(name, fault):
-    """A fault in what a function of the script returns."""
+def after(name, fault, of_agent=False):
+    """A fault in what a function of the script, or a method of the agent, returns."""
 
     def plant(script, monkeypatch):
-        function = getattr(script, name)
-        monkeypatch.setattr(script, name, lambda *args, **kwargs: fault(function(*args, **kwargs)))
+        owner = script.Agent if of_agent else script
+        function = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *args, **kwargs: fault(function(*args, **kwargs)))
 
     return plant
 
@@ -286,6 +287,7 @@ FAULTS = {
     "bounds": (put_on_cpu("action_low"), OTHER_DEVICE),
     "advantages": (after("compute_gae", lambda x: (x[0] + torch.zeros(x[0].shape), x[1])), OTHER_DEVICE),
     "loss": (after("update_minibatch", lambda x: x * torch.ones(6)), OTHER_DEVICE),
+    "noise": (after("clip_action", lambda x: x + 0.1 * torch.randn(x.shape), of_agent=True), OTHER_DEVICE),
     "detour": (after("update_minibatch", lambda x: x.cpu().to(x.device)), WAITS),
     "number": (after("update_minibatch", lambda x: x * x[0].item()), WAITS),
     "within a function of torch": (after("update_minibatch", lambda x: x * one_hot(x.long().clamp(0, 5)).sum()), WAITS),

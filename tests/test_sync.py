@@ -12,7 +12,8 @@ import ppo_rgb
 
 # what differs above the banner; everything else that both have there must be equal
 DIFFERENT = {"Args", "Agent", "check_observations", "make_env", "rollout", "update_minibatch"}
-DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "FIXED_FLAGS", "LIMITS", "UPDATE_THREADS_PER_CORE"}
+DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "GPU_BATCH_SIZE", "NUM_ITERATIONS", "FIXED_FLAGS", "LIMITS"}
+DIFFERENT_CONSTANTS |= {"UPDATE_THREADS_PER_CORE"}
 DIFFERENT_HELP = {"obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs"}
 
 
@@ -79,7 +80,8 @@ def test_flags_that_both_have_are_the_same():
     assert b.keys() - a.keys() == set(of_images.split())
     shared = a.keys() & b.keys()
     assert {k for k in shared if a[k].type != b[k].type} == {"shader"}
-    different = {"obs_mode", "num_envs", "target_kl", "render_mode", "shader"}
+    different = {"obs_mode", "num_envs", "render_mode", "shader", "learning_rate", "anneal_lr", "gamma", "gae_lambda"}
+    different |= {"num_minibatches", "update_epochs", "target_kl", "desired_kl", "norm_obs", "logstd_lr_factor"}
     assert {k for k in shared if a[k].default != b[k].default} == different
     x, y = help_texts("ppo.py"), help_texts("ppo_rgb.py")
     assert x.keys() == a.keys() and y.keys() == b.keys(), "every flag has a help text"

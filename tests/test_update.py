@@ -12,6 +12,7 @@ OBS, ACT, ROWS = 5, 3, 40
 
 def make(**flags):
     torch.manual_seed(0)
+    flags = dict(desired_kl=None, norm_obs=False) | flags
     args = ppo.Args(learning_rate=1e-2, **flags)
     agent = ppo.Agent(box(OBS), box(ACT), args).double()
     with torch.no_grad():
