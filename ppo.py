@@ -190,7 +190,7 @@ class Args:
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
     """learning rate of the agent's `critic` (None: learning_rate)"""
-    logstd_lr_factor: float = 20.0
+    logstd_lr_factor: float = 7.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: GPU_BATCH_SIZE or CPU_BATCH_SIZE / num_envs, at least 5)"""
@@ -279,8 +279,8 @@ class Args:
         return self.total_timesteps // self.batch_size
 
 
-# On a CPU, steps cost more, and an iteration has fewer: too few for a larger change of the policy.
-CPU_DEFAULTS = dict(desired_kl=0.05, eval_freq=10)
+# On a CPU, an iteration has fewer steps: too few to change the policy as much. Then its noise has to fall faster.
+CPU_DEFAULTS = dict(desired_kl=0.05, logstd_lr_factor=20.0, eval_freq=10)
 GPU_BATCH_SIZE = 4096  # steps of an iteration, unless num_steps is given
 CPU_BATCH_SIZE = 1600
 NUM_ITERATIONS = 75  # unless total_timesteps is given
