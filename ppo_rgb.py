@@ -193,7 +193,7 @@ class Args:
     """further arguments of gym.make as JSON, such as '{"sensor_configs": {"fov": 0.6}}'"""
     # --- PPO ---
     total_timesteps: Optional[int] = None
-    """total number of environment steps (None: NUM_ITERATIONS iterations, enough for PushCube-v1)"""
+    """total number of environment steps (None: as many as PushCube-v1 needs; other tasks need more)"""
     learning_rate: float = 3e-4
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
@@ -201,7 +201,7 @@ class Args:
     logstd_lr_factor: float = 1.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
-    """steps in each environment per iteration (None: GPU_BATCH_SIZE or CPU_BATCH_SIZE / num_envs, at least 5)"""
+    """steps in each environment per iteration (None: fewer if there are more environments, at least 5)"""
     anneal_lr: bool = False
     """lower the learning rate linearly to zero over the run (with desired_kl: that of the critic only)"""
     gamma: float = 0.8
@@ -1712,7 +1712,7 @@ def layers_size(agent, storage: dict) -> float:
         return x
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda x: x):
-        _outputs = agent.get_action_and_value(*rows)
+        agent.get_action_and_value(*rows)
     return sum(size for address, size in sizes.items() if address not in weights) / 2
 
 
