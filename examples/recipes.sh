@@ -97,42 +97,32 @@ cartpole_balance_images_cpu() {
         --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --reward_scale 0.1 --total_timesteps 72000 "$@"
 }
 
-# --- states, GPU: all flags of ManiSkill's ppo.py, so that they do here what they do there ---
+# --- states, GPU: with all of ManiSkill's defaults that differ from ours, so that they do here what they do there ---
 
 maniskill() {
-    python ppo.py --num_steps 50 --num_minibatches 32 --learning_rate 3e-4 --no-anneal_lr --gamma 0.8 --gae_lambda 0.9 \
-        --target_kl 0.1 --desired_kl None --logstd_lr_factor 1 --no-norm_obs --success_steps 1 --eval_freq 25 "$@"
+    python "$1" --num_steps 50 --num_minibatches 32 --update_epochs 8 --learning_rate 3e-4 --no-anneal_lr --gamma 0.8 \
+        --gae_lambda 0.9 --target_kl 0.1 --desired_kl None --logstd_lr_factor 1 --no-norm_obs --success_steps 1 \
+        --eval_freq 25 "${@:2}"
 }
 
 push_cube_gpu() {
-    maniskill --env_id PushCube-v1 --num_envs 2048 --update_epochs 8 --total_timesteps 2000000 --eval_freq 10 \
-        --num_steps 20 "$@"
+    maniskill ppo.py --env_id PushCube-v1 --num_envs 2048 --total_timesteps 2000000 --eval_freq 10 --num_steps 20 "$@"
 }
-pick_cube_gpu() {
-    maniskill --env_id PickCube-v1 --num_envs 1024 --update_epochs 8 --total_timesteps 10000000 "$@"
-}
-stack_cube_gpu() {
-    maniskill --env_id StackCube-v1 --num_envs 1024 --update_epochs 8 --total_timesteps 25000000 "$@"
-}
+pick_cube_gpu() { maniskill ppo.py --env_id PickCube-v1 --num_envs 1024 --total_timesteps 10000000 "$@"; }
+stack_cube_gpu() { maniskill ppo.py --env_id StackCube-v1 --num_envs 1024 --total_timesteps 25000000 "$@"; }
 cartpole_swing_up_gpu() {
-    maniskill --env_id MS-CartpoleSwingUp-v1 --num_envs 1024 --update_epochs 8 --total_timesteps 10000000 \
-        --num_steps 250 --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 --eval_freq 5 "$@"
+    maniskill ppo.py --env_id MS-CartpoleSwingUp-v1 --num_envs 1024 --total_timesteps 10000000 --num_steps 250 \
+        --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 --eval_freq 5 "$@"
 }
 
 # --- images, GPU: as above ---
 
-maniskill_images() {
-    python ppo_rgb.py --num_steps 50 --num_minibatches 8 --learning_rate 3e-4 --no-anneal_lr --gamma 0.8 --gae_lambda 0.9 \
-        --target_kl 0.2 --desired_kl None --logstd_lr_factor 1 --no-norm_obs --success_steps 1 --eval_freq 25 "$@"
-}
+maniskill_images() { maniskill ppo_rgb.py --num_envs 256 --num_minibatches 8 --target_kl 0.2 "$@"; }
 
 push_cube_images_gpu() {
-    maniskill_images --env_id PushCube-v1 --num_envs 256 --update_epochs 8 --total_timesteps 1000000 --eval_freq 10 \
-        --num_steps 20 "$@"
+    maniskill_images --env_id PushCube-v1 --total_timesteps 1000000 --eval_freq 10 --num_steps 20 "$@"
 }
-pick_cube_images_gpu() {
-    maniskill_images --env_id PickCube-v1 --num_envs 256 --update_epochs 8 --total_timesteps 10000000 "$@"
-}
+pick_cube_images_gpu() { maniskill_images --env_id PickCube-v1 --total_timesteps 10000000 "$@"; }
 
 recipes=$(declare -F | awk '$3 ~ /_[cg]pu$/ {print $3}')
 if [ $# = 0 ] || ! grep -qxF -- "$1" <<<"$recipes"; then

@@ -63,8 +63,7 @@ def test_shared_memory(monkeypatch, capsys):
     obs_space = lambda size: ppo_rgb.gym.spaces.Dict(rgb=ppo_rgb.gym.spaces.Box(0, 255, (size, size, 3), "uint8"))
     action_space, cpu = ppo_rgb.gym.spaces.Box(-1, 1, (8,)), torch.device("cpu")
     args = ppo_rgb.Args(num_envs=64, num_steps=25, num_actors=2)
-    make_agent = lambda *spaces: ppo_rgb.Agent(*spaces, args)
-    make_storage = lambda *spaces: ppo_rgb.make_storage(make_agent(*spaces), *spaces, args, cpu)
+    make_storage = lambda *spaces: ppo_rgb.make_storage(ppo_rgb.Agent(*spaces, args), *spaces, args, cpu)
     assert make_storage(obs_space(102), action_space)["obs"]["rgb"].shape[:2] == (25, 64)
     with pytest.raises(SystemExit):
         make_storage(obs_space(120), action_space)

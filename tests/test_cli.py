@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, read_metrics, refused, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_script, same_weights
 
 import ppo
 
@@ -378,22 +378,19 @@ def test_films_have_a_renderer_before_any_other_environment(tmp_path, monkeypatc
     def parse(sim_backend, render_backend):
         return SimpleNamespace(render_device=SimpleNamespace(can_render=lambda: True, name=render_backend))
 
-    class Stop(Exception):
-        pass
-
-    def stop(*args):
+    def build(*args):
         made.append("environments")
-        raise Stop
+        crash()
 
     monkeypatch.setattr(ppo, "find_render_error", lambda args: None)
     monkeypatch.setattr(ppo, "parse_backends", parse)
     monkeypatch.setattr(ppo.sapien.render, "RenderSystem", lambda device: made.append(device.name))
-    monkeypatch.setattr(ppo, "Actors", stop)
+    monkeypatch.setattr(ppo, "Actors", build)
     args = ppo.Args(sim_backend=sim_backend, cuda=False, exp_name=str(tmp_path / "x"))
     monkeypatch.setattr(ppo, "choose_device", lambda args: torch.device("cpu"))
-    for run, flags in ((ppo.train, {}), (ppo.evaluate_checkpoint, {})):
+    for run in (ppo.train, ppo.evaluate_checkpoint):
         with contextlib.ExitStack() as closing, pytest.raises(Stop):
-            run(replace(args, **flags), closing)
+            run(args, closing)
     assert made == [expected, "environments"] * 2
     with contextlib.ExitStack() as closing:
         ppo.Film(replace(args, capture_video=False), tmp_path, closing)

@@ -10,7 +10,7 @@ each other: shared caches, memory bandwidth, a lower clock. Machines with many c
 import argparse
 import statistics
 import sys
-import time
+import timeit
 from pathlib import Path
 from unittest import mock
 
@@ -23,12 +23,7 @@ import torch
 
 def median_time(function, repetitions: int) -> float:
     """Seconds."""
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    return statistics.median(timeit.repeat(function, number=1, repeat=repetitions))
 
 
 def step_time(args: ppo.Args, num_envs: int) -> float:
@@ -38,12 +33,8 @@ def step_time(args: ppo.Args, num_envs: int) -> float:
     agent = ppo.make_agent(envs.single_observation_space, envs.single_action_space, args, {})
     obs, _ = envs.reset(seed=list(range(num_envs)))
 
-    @torch.no_grad()
-    def step():
-        nonlocal obs
-        obs = envs.step(agent.clip_action(agent.get_action_and_value(obs)[0]))[0]
-
-    seconds = median_time(step, 100)
+    with torch.no_grad():
+        seconds = median_time(lambda: envs.step(agent.clip_action(agent.get_action_and_value(obs)[0])), 100)
     envs.close()
     return seconds
 
@@ -74,7 +65,7 @@ def main():
         with mock.patch.object(ppo, "num_cores", lambda cores=cores: cores):
             args = ppo.parse_args(["--no-cuda", "--env_id", env_id])
         gradient_steps = args.update_epochs * args.num_minibatches
-        rollout = args.num_steps * step_time(args, -(-args.num_envs // args.num_actors))
+        rollout = args.num_steps * step_time(args, len(ppo.even_share(args.num_envs, 0, args.num_actors)))
         update = gradient_steps * minibatch_time(args, args.batch_size // args.num_minibatches)
         seconds = args.num_iterations * (rollout + update)
         print(
