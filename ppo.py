@@ -537,13 +537,13 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
 
 
 @torch.no_grad()
-def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
+def rollout(agent, envs, storage: dict, obs, args: Args, act, get_value) -> tuple:
     """Act for num_steps in the environments of one actor, and write what happens into its columns of the storage.
 
     Args:
         storage: obs, actions, logprobs, rewards, dones, values and next_values, each (num_steps, num_envs, ...).
         obs: (num_envs, obs_dim), the first observation.
-        act: agent.get_action_and_value, or a CUDA graph of it.
+        act, get_value: agent.get_action_and_value and agent.get_value, or CUDA graphs of them.
 
     Returns the next observation, and sums over the episodes that ended: a dict of scalars."""
     final_values = torch.zeros_like(storage["next_values"])
@@ -560,10 +560,10 @@ def rollout(agent, envs, storage: dict, obs, args: Args, act) -> tuple:
             # ManiSkill's rewards are positive at every step: without the final value, an early success would earn less
             # than dawdling. "truncated" is the textbook rule (Pardo et al. 2018, arXiv 1712.00378).
             bootstraps = {"always": done, "truncated": truncated & ~terminated, "never": torch.zeros_like(done)}
-            final_value = agent.get_value(infos["final_observation"])
+            final_value = get_value(infos["final_observation"])
             final_values[step] = torch.where(bootstraps[args.bootstrap_at_done], final_value, 0.0)
             add_episodes(sums, infos["final_info"], done)
-    following_values = torch.cat([storage["values"][1:], agent.get_value(obs)[None]])
+    following_values = torch.cat([storage["values"][1:], get_value(obs)[None]])
     storage["next_values"].copy_(torch.where(storage["dones"].bool(), final_values, following_values))
     return obs, sums
 
@@ -1340,7 +1340,7 @@ class Actor:
     def receive(self, agent, storage: dict) -> None:
         """Take the agent, and the storage to write into: this actor's columns."""
         columns = slice(self.env_idx.start, self.env_idx.stop)
-        self.agent, self.act = agent, agent.get_action_and_value
+        self.agent, self.act, self.get_value = agent, agent.get_action_and_value, agent.get_value
         self.storage = tree_map(lambda x: x[:, columns], storage)
 
     @torch.no_grad()
@@ -1351,7 +1351,8 @@ class Actor:
             seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
             seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation seeds are below
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
-        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act)
+        functions = self.act, self.get_value
+        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, *functions)
         if (iteration + 1) % self.rebuild_freq == 0:
             self.finish_all_episodes(sums)
         return sums
@@ -1430,6 +1431,7 @@ class Actors:
             for network in {self.learner, self.agent}:  # on one device they are the same
                 network.get_action_and_value = torch.compile(network.get_action_and_value, dynamic=False)
         self.actor0.act = CudaGraph(self.agent.get_action_and_value, args, self.device)
+        self.actor0.get_value = CudaGraph(self.agent.get_value, args, self.device)
         return self.learner_storage
 
     def call(self, method: str, *arguments) -> list:
@@ -1482,7 +1484,7 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
     storage["actions"] = empty(action_space.shape)
 
     stored = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
-    num_rows = args.batch_size // args.num_minibatches + args.num_envs  # for a gradient, and for acting
+    num_rows = args.batch_size // args.num_minibatches + 2 * args.num_envs  # a gradient, acting, final values
     used = stored + num_rows * layers_size(agent, storage)
     places = []
     if device.type == "cpu":
@@ -1569,7 +1571,10 @@ class Checkpoints:
     def take(self, iteration: int, global_step: int) -> None:
         """Copy the state from which a resumed run goes on, and write it if that is due."""
         state = {name: x.state_dict() for name, x in self.saved.items()}
-        state = tree_map(lambda x: x.to("cpu", copy=True) if isinstance(x, torch.Tensor) else x, state)
+        copied = lambda x: x.to("cpu", copy=True, non_blocking=True) if isinstance(x, torch.Tensor) else x
+        state = tree_map(copied, state)
+        if self.saved["agent"].actor_logstd.is_cuda:
+            torch.cuda.synchronize()  # the host waits once, not for each tensor
         progress = dict(iteration=iteration, global_step=global_step, finished=False, best_score=self.best_score)
         self.contents = state | progress | self.run_info | dict(metrics_size=self.logger.file.tell())
         if iteration % self.args.checkpoint_freq == 0:

@@ -133,6 +133,7 @@ def call(func, args: tuple, kwargs: dict):
         check_devices(func, args, on_gpu, on_cpu)
         has_mask = name == "__getitem__" and any(x.dtype == torch.bool and x.ndim > 0 for x in tensors[1:])
         crosses = bool(on_gpu) and not result_on_gpu or any(x.ndim > 0 or func in COPIES for x in on_cpu)
+        crosses = crosses and not kwargs.get("non_blocking", False)
         if func in READS or crosses or has_mask or func in MAKES and not on_gpu:
             wait(func)
         if func in (Tensor.to, Tensor.cuda, Tensor.cpu):
@@ -189,6 +190,10 @@ def capture(graph: Recording, **options):
         PretendedGpu.refused = None
 
 
+def synchronize(*device) -> None:
+    wait(synchronize)
+
+
 def set_sync_debug_mode(mode: str) -> None:
     PretendedGpu.refused = "the host must not wait" if mode == "error" else None
 
@@ -204,7 +209,7 @@ def group_by_device(lists, with_indices=False):
 GROUP = torch._C._group_tensors_by_device_and_dtype
 TORCH_CUDA = SimpleNamespace(
     is_available=lambda: True, is_bf16_supported=lambda: True, device_count=lambda: 1, current_device=lambda: 0,
-    set_device=lambda device: None, synchronize=lambda *device: None, get_device_name=lambda *device: "a pretended GPU",
+    set_device=lambda device: None, synchronize=synchronize, get_device_name=lambda *device: "a pretended GPU",
     mem_get_info=lambda *device: (2**34, 2**34), manual_seed=lambda seed: None, manual_seed_all=lambda seed: None,
     get_rng_state=lambda *device: None, set_rng_state=lambda *state: None,  # it draws from the CPU's generator
     is_current_stream_capturing=lambda: Stream().is_capturing(), set_sync_debug_mode=set_sync_debug_mode,

@@ -94,7 +94,7 @@ def build():
 def flat(tree, prefix):
     if isinstance(tree, dict):
         return {k: v for key, value in tree.items() for k, v in flat(value, f"{prefix}/{key}").items()}
-    return {prefix: torch.as_tensor(tree)}
+    return {prefix: torch.as_tensor(tree).cpu()}  # a single environment leaves its pictures on a GPU that renders
 
 
 def rows(tree, row):
@@ -680,7 +680,9 @@ def test_pictures(build, env_id):
         a, b = flat(a, "obs"), flat(b, "obs")
         assert {name.rsplit("/", 1)[1] for name in b if "sensor_data" in name} == {*TEXTURES.split("+")}
         for name in b:
-            assert a[name][1:2].shape == b[name].shape and a[name].dtype == b[name].dtype, name
+            assert a[name][1:2].shape == b[name].shape, name
+            is_on_gpu = single.backend.render_backend == "sapien_cuda"  # there, segmentation has 32 bits, not 64
+            assert a[name].dtype == b[name].dtype or is_on_gpu and "segmentation" in name
             if "sensor_data" in name:
                 different = (a[name][1:2].double() - b[name].double()).abs() > 1  # a millimetre, or one of 255 levels
                 assert different.double().mean() < 1e-3, name
@@ -688,7 +690,7 @@ def test_pictures(build, env_id):
             else:
                 assert equal(a[name], b[name]), name
         filmed = batch.render(), single.render()
-        assert equal(*[picture.double() / 255 for picture in filmed]) and filmed[1].double().std() > 1
+        assert equal(*[picture.cpu().double() / 255 for picture in filmed]) and filmed[1].double().std() > 1
         assert equal(batch.agent.robot.links[-1].pose.raw_pose, single.agent.robot.links[-1].pose.raw_pose)
     if env_id == "PickCube-v1":  # rendering hides the goal from the sensors, and shows it again
         visible = batch.render()

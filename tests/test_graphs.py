@@ -215,8 +215,8 @@ def test_the_host_waits_for_nothing_in_rollout_and_update(train, script, device,
     monkeypatch.setattr(script, "rollout", guarded_rollout)
     monkeypatch.setattr(script, "CudaGraph", no_waits)
     train(norm_obs=True)
-    assert calls == dict(rollout=4, step=40, get_action_and_value=40, update_epoch=calls["update_epoch"])
-    assert calls["update_epoch"] >= 4
+    assert calls.pop("update_epoch") >= 4 and calls.pop("get_value") > 4, "at the end of a rollout, and of episodes"
+    assert calls == dict(rollout=4, step=40, get_action_and_value=40)
     mode("error")
     with pytest.raises(RuntimeError):
         torch.ones(1, device=device).item()
@@ -250,8 +250,7 @@ def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
         an_iteration.append(counts[1] - counts[0])
     assert an_iteration[0] == an_iteration[1]
     assert (an_iteration[2] - an_iteration[0]) == Counter(__bool__=3)
-    del an_iteration[0]["to"]  # the checkpoint: a copy of each tensor
-    assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1)
+    assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1, synchronize=1)
 
 
 def put_on_cpu(name):
@@ -294,7 +293,7 @@ FAULTS = {
     "branch": (after("update_minibatch", lambda x: x if x[0] > 0 else -x), WAITS),
     "mask": (after("update_minibatch", lambda x: x[x < 1e9]), WAITS),
     "constant": (after("update_minibatch", lambda x: x * torch.tensor([1.0] * 6, device=x.device)), WAITS),
-    "check of arguments": (after("update_minibatch", lambda x: Normal(x, x.exp()).mean), WAITS),
+    "check of arguments": (after("update_minibatch", lambda x: Normal(x, x.exp(), validate_args=True).mean), WAITS),
 }
 
 

@@ -65,7 +65,7 @@ def test_observations_are_maniskills(env_id, obs_mode, flags):
         assert env.observation_space.contains({k: v.numpy() for k, v in obs.items()})
         single = env.get_wrapper_attr("single_observation_space")
         for k in obs_mode.split("+"):
-            images = torch.cat([camera[k] for camera in cameras], dim=-1)
+            images = torch.cat([camera[k] for camera in cameras], dim=-1).cpu()
             if k == "segmentation":  # the default shader gives 8 bytes, and 2 are enough
                 images = images.short()
             assert obs[k].dtype == images.dtype and single[k].shape == tuple(obs[k].shape[1:])
@@ -329,8 +329,9 @@ def test_learns_from_images(train, device):
     assert early < 0.2 and late >= 0.8
 
 
-def test_exact_resume_is_bit_identical(train, in_update, in_tmp):
-    flags = dict(exact_resume=True, checkpoint_freq=2, obs_mode="rgb+segmentation", frame_stack=2, random_shift=2)
+def test_exact_resume_is_bit_identical(train, in_update, in_tmp, device):
+    obs_mode = "rgb" if device.type == "cuda" else "rgb+segmentation"  # CUDA adds an embedding's gradients in any order
+    flags = dict(exact_resume=True, checkpoint_freq=2, obs_mode=obs_mode, frame_stack=2, random_shift=2)
     train(**flags)
     in_update(3, crash, per_iteration=16)
     with pytest.raises(Stop):
@@ -421,7 +422,8 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
     # evaluation needs only the checkpoint: it contains the flags of the cameras
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    flags = ("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 1, "--num_eval_envs", 1)
+    flags = ("--evaluate", "--checkpoint", run / "best.pt", "--num_eval_episodes", 1, "--num_eval_envs", 1,
+             "--sim_backend", "physx_cpu")  # fmt: skip
     assert ppo_rgb.main([*map(str, flags)]) == 0
     assert json.loads((run / "eval.json").read_text())["episode_len"] == 8
     assert (run / "test_videos/seed_0.mp4").exists()

@@ -255,7 +255,7 @@ def test_equals_replay(success_steps, rule, partial_reset, norm_obs):
         spy.steps.clear()
         storage, first_obs = make_storage(args, 4, 2), obs.clone()
         torch.manual_seed(number)
-        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value)
+        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value, agent.get_value)
         assert not any(x.requires_grad for x in [*storage.values(), *sums.values()])
         # what is drawn in each step: the noise of the actions, and which successes end an episode
         torch.manual_seed(number)
@@ -281,7 +281,7 @@ def test_rollout_without_an_end():
     envs = ppo.ManiSkillVectorEnv(spy, ignore_terminations=True, record_metrics=True)
     agent = make_agent(box(4), spy.get_wrapper_attr("single_action_space"), args)
     first_obs, storage = envs.reset()[0].clone(), make_storage(args, 4, 2)
-    obs, sums = ppo.rollout(agent, envs, storage, first_obs, args, agent.get_action_and_value)
+    obs, sums = ppo.rollout(agent, envs, storage, first_obs, args, agent.get_action_and_value, agent.get_value)
     episodes = [fresh_episode() for _ in range(args.num_envs)]
     wanted = replay(Network(agent), args, first_obs, spy.steps, episodes)[0]
     np.testing.assert_allclose(storage["next_values"], wanted["next_values"], rtol=1e-4, atol=1e-4)
@@ -338,7 +338,7 @@ def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
     for _ in range(2):
         spy.steps.clear()
         storage, first_obs = make_storage(args, obs.shape[1], 8), obs.clone()
-        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value)
+        obs, sums = ppo.rollout(agent, envs, storage, obs, args, agent.get_action_and_value, agent.get_value)
         ends, _ = compare(agent, args, spy, first_obs, storage, sums, obs, episodes)
         assert ends["late"] >= args.num_envs
     ended = [step for step in spy.steps if "reset_obs" in step]

@@ -54,9 +54,9 @@ class Run:
                 Reach(num_envs), auto_reset=not evaluation, ignore_terminations=evaluation, record_metrics=True
             )
 
-        def spy_rollout(agent, envs, storage, obs, args, act):
+        def spy_rollout(agent, envs, storage, obs, args, *functions):
             before, obs = copied(agent.state_dict()), obs.clone()
-            result = rollout(agent, envs, storage, obs, args, act)
+            result = rollout(agent, envs, storage, obs, args, *functions)
             sums = {k: v.item() for k, v in result[1].items()}
             records = dict(first_obs=obs, next_obs=result[0].clone(), storage=copied(storage), before=before)
             self.iterations.append(dict(**records, sums=sums, updates=[]))
