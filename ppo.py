@@ -190,7 +190,7 @@ class Args:
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
     """learning rate of the agent's `critic` (None: learning_rate)"""
-    logstd_lr_factor: float = 10.0
+    logstd_lr_factor: float = 7.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: fewer if there are more environments, at least 5)"""
