@@ -253,7 +253,7 @@ class Args:
     compile: bool = False
     """compile the network with torch.compile, which takes a minute"""
     cudagraphs: bool = True
-    """on a GPU, launch a step of the policy, and an epoch of the update, as one CUDA graph"""
+    """on a GPU, launch a step of the policy, values, and an epoch of the update as one CUDA graph each"""
     # --- Evaluation, checkpoints, videos ---
     eval_freq: int = 25
     """evaluate every so many iterations, and always before the first and after the last (0: only then)"""
@@ -1552,8 +1552,7 @@ class Actor:
             seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
             seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation seeds are below
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
-        functions = self.act, self.get_value
-        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, *functions)
+        self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act, self.get_value)
         if (iteration + 1) % self.rebuild_freq == 0:
             self.finish_all_episodes(sums)
         return sums

@@ -132,8 +132,8 @@ def call(func, args: tuple, kwargs: dict):
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
         check_devices(func, args, on_gpu, on_cpu)
         has_mask = name == "__getitem__" and any(x.dtype == torch.bool and x.ndim > 0 for x in tensors[1:])
-        crosses = bool(on_gpu) and not result_on_gpu or any(x.ndim > 0 or func in COPIES for x in on_cpu)
-        crosses = crosses and not kwargs.get("non_blocking", False)
+        leaves = bool(on_gpu) and not result_on_gpu and not kwargs.get("non_blocking")
+        crosses = leaves or any(x.ndim > 0 or func in COPIES for x in on_cpu)
         if func in READS or crosses or has_mask or func in MAKES and not on_gpu:
             wait(func)
         if func in (Tensor.to, Tensor.cuda, Tensor.cpu):

@@ -682,7 +682,7 @@ def test_pictures(build, env_id):
         for name in b:
             assert a[name][1:2].shape == b[name].shape, name
             is_on_gpu = single.backend.render_backend == "sapien_cuda"  # there, segmentation has 32 bits, not 64
-            assert a[name].dtype == b[name].dtype or is_on_gpu and "segmentation" in name
+            assert a[name].dtype == b[name].dtype or is_on_gpu and "segmentation" in name, name
             if "sensor_data" in name:
                 different = (a[name][1:2].double() - b[name].double()).abs() > 1  # a millimetre, or one of 255 levels
                 assert different.double().mean() < 1e-3, name

@@ -531,7 +531,7 @@ def test_physics_that_explode_end_the_run(in_tmp, monkeypatch, capfd):
     assert ppo.main(["--resume", "runs/x", "--total_timesteps", str(steps)]) == 0
 
 
-@pytest.mark.parametrize("encoder, num_envs", [("nature", 8), (None, 512)])
+@pytest.mark.parametrize("encoder, num_envs", [("nature", 8), ("impala", 8), (None, 512)])
 def test_memory_that_is_too_small_is_refused(monkeypatch, capsys, encoder, num_envs):
     """It counts what a rollout stores, and what a minibatch and the acting policy compute: at least the outputs of all
     activation functions, added up by hooks."""
