@@ -171,6 +171,8 @@ class Args:
     """end a training episode at success or failure; --no-partial_reset: only at the time limit"""
     success_steps: float = 10.0
     """steps of success before a training episode ends, on average, so that the policy learns to stay (1: the first)"""
+    staggered_resets: bool = True
+    """cut the first training episodes short at random: then even a short rollout sees all parts of an episode"""
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
@@ -190,7 +192,7 @@ class Args:
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
     """learning rate of the agent's `critic` (None: learning_rate)"""
-    logstd_lr_factor: float = 7.0
+    logstd_lr_factor: float = 3.0
     """learning rate of the policy's standard deviation, in multiples of learning_rate"""
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: fewer if there are more environments, at least 5)"""
@@ -1351,6 +1353,9 @@ class Actor:
             seeds = np.random.SeedSequence([self.args.seed, iteration, RANK]).generate_state(self.args.num_envs)
             seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation seeds are below
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
+            limit = find_max_episode_steps_value(self.envs)
+            if self.args.staggered_resets and self.args.partial_reset and limit:
+                self.envs.base_env.elapsed_steps.random_(limit)  # Bharthulwar et al. 2025, arXiv 2511.21011
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act, self.get_value)
         if (iteration + 1) % self.rebuild_freq == 0:
             self.finish_all_episodes(sums)

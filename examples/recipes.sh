@@ -102,7 +102,7 @@ cartpole_balance_images_cpu() {
 maniskill() {
     python "$1" --num_steps 50 --num_minibatches 32 --update_epochs 8 --learning_rate 3e-4 --no-anneal_lr --gamma 0.8 \
         --gae_lambda 0.9 --target_kl 0.1 --desired_kl None --logstd_lr_factor 1 --no-norm_obs --success_steps 1 \
-        --eval_freq 25 "${@:2}"
+        --no-staggered_resets --eval_freq 25 "${@:2}"
 }
 
 push_cube_gpu() {

@@ -251,8 +251,8 @@ def test_recipes_are_commands(run_recipe, in_tmp, monkeypatch):
 OF_MANISKILL = dict(
     learning_rate=3e-4, anneal_lr=False, gamma=0.8, gae_lambda=0.9, norm_adv=True, clip_coef=0.2, clip_vloss=False,
     ent_coef=0.0, vf_coef=0.5, max_grad_norm=0.5, reward_scale=1.0, finite_horizon_gae=False, partial_reset=True,
-    success_steps=1, desired_kl=None, logstd_lr_factor=1, norm_obs=False, layer_norm=False, logstd_init=-0.5,
-    logstd_final=None, bootstrap_at_done="always", critic_learning_rate=None,
+    success_steps=1, staggered_resets=False, desired_kl=None, logstd_lr_factor=1, norm_obs=False, layer_norm=False,
+    logstd_init=-0.5, logstd_final=None, bootstrap_at_done="always", critic_learning_rate=None,
 )  # fmt: skip
 
 

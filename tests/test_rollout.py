@@ -348,7 +348,7 @@ def test_equals_replay_of_a_simulated_batch(rule, partial_reset):
 
 # --- the environments of several actors ---
 
-TWO = replace(PUSH, num_envs=4, num_actors=2, num_eval_envs=4, env_kwargs="{}")
+TWO = replace(PUSH, num_envs=4, num_actors=2, num_eval_envs=4, env_kwargs="{}", staggered_resets=False)
 
 
 def noise_alone(obs):
@@ -435,6 +435,28 @@ def test_episodes_go_on_from_one_iteration_to_the_next(actors):
         assert actor.envs.base_env.elapsed_steps.tolist() == [TWO.num_steps * (number + 1)] * 2
     noise_of(actor, 0, restart=True)
     torch.testing.assert_close(actor.storage["obs"][0], first, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("partial_reset", [True, False])
+def test_staggered_resets(partial_reset):
+    """The first episodes end anywhere within the time limit, later ones at it. --no-partial_reset ends all at once."""
+    limit = 8
+    args = replace(PUSH, num_envs=33, num_steps=3 * limit, env_kwargs=f'{{"max_episode_steps": {limit}}}')
+    ends = {}
+    for staggered in (True, False):
+        actor = ppo.Actor(replace(args, partial_reset=partial_reset, staggered_resets=staggered), 0)
+        storage = make_storage(args, actor.envs.single_observation_space.shape[0], 8)
+        actor.receive(make_agent(actor.envs.single_observation_space, actor.envs.single_action_space, args), storage)
+        actor.rollout(0, is_first=True)
+        actor.close()
+        ends[staggered] = [env.nonzero().flatten().tolist() for env in storage["dones"].T]
+    assert ends[False] == [[limit - 1, 2 * limit - 1, 3 * limit - 1]] * 33
+    if not partial_reset:
+        assert ends[True] == ends[False]
+        return
+    assert {first for first, *_ in ends[True]} == {*range(limit)}
+    for steps in ends[True]:
+        assert steps == [*range(steps[0], 3 * limit, limit)]
 
 
 @register_env("OtherCubes-v0", max_episode_steps=6)

@@ -82,6 +82,7 @@ def test_flags_that_both_have_are_the_same():
     assert {k for k in shared if a[k].type != b[k].type} == {"shader"}
     different = {"obs_mode", "num_envs", "render_mode", "shader", "learning_rate", "anneal_lr", "gamma", "gae_lambda"}
     different |= {"num_minibatches", "update_epochs", "target_kl", "desired_kl", "norm_obs", "logstd_lr_factor"}
+    different |= {"staggered_resets"}
     assert {k for k in shared if a[k].default != b[k].default} == different
     x, y = help_texts("ppo.py"), help_texts("ppo_rgb.py")
     assert x.keys() == a.keys() and y.keys() == b.keys(), "every flag has a help text"
