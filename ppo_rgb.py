@@ -1556,7 +1556,8 @@ class Actor:
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
             limit = find_max_episode_steps_value(self.envs)
             if self.args.staggered_resets and self.args.partial_reset and limit:
-                self.envs.base_env.elapsed_steps.random_(limit)  # Bharthulwar et al. 2025, arXiv 2511.21011
+                # these episodes count as begun earlier, in the log as well (Bharthulwar et al. 2025, arXiv 2511.21011)
+                self.envs.base_env.elapsed_steps.random_(limit)
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act, self.get_value)
         if (iteration + 1) % self.rebuild_freq == 0:
             self.finish_all_episodes(sums)
