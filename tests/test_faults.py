@@ -147,7 +147,7 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     """This holds even if the run resumes from a checkpoint that is older than best.pt."""
     train(**RUN)
     best = ppo.load_checkpoint("runs/run1/best.pt")
-    torch.save(best | {"best_score": [1.0, 20.0]}, "runs/run1/best.pt")
+    torch.save(best | {"best_score": [2.0, 1e6]}, "runs/run1/best.pt")
     before = Path("runs/run1/best.pt").read_bytes()
     train(**RUN, resume="runs/run1/iteration_5.pt")
     assert Path("runs/run1/best.pt").read_bytes() == before

@@ -442,7 +442,7 @@ def test_a_real_task(in_tmp):
     args = ppo.Args(
         sim_backend="physx_cpu", num_envs=4, num_actors=1, num_steps=15, total_timesteps=120, num_minibatches=4,
         num_eval_envs=3, num_eval_episodes=5, exp_name="x", capture_video=False, save_trajectory=True, cuda=False,
-        env_kwargs='{"max_episode_steps": 10}',
+        env_kwargs='{"max_episode_steps": 10}', staggered_resets=False,
     )  # fmt: skip
     with contextlib.ExitStack() as closing:
         ppo.train(args, closing)
