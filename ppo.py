@@ -1332,6 +1332,7 @@ class Actor:
             seed = int(np.random.SeedSequence([args.seed, RANK, index]).generate_state(1)[0]) // 2
             self.envs = make_envs(args, len(self.env_idx), seed)
             self.rebuild_freq = training_rebuild_freq(args, self.envs)
+            self.staggers = args.staggered_resets and args.partial_reset and find_reset_error(self.envs) is None
         record = dict(output_dir=str(folder), trajectory_name=f"trajectory_{index}") if args.save_trajectory else None
         seed = args.eval_seed + RANK * args.num_eval_episodes + eval_episodes.start
         self.eval_envs = make_envs(args, max(1, num_eval_envs), seed, evaluation=True, record=record)
@@ -1354,7 +1355,7 @@ class Actor:
             seeds = (seeds[self.env_idx] // 2 + 2**31).tolist()  # evaluation seeds are below
             self.obs, _ = self.envs.reset(seed=seeds, options=dict(reconfigure=self.rebuild_freq < math.inf))
             limit = find_max_episode_steps_value(self.envs)
-            if self.args.staggered_resets and self.args.partial_reset and limit:
+            if self.staggers and limit:
                 # these episodes count as begun earlier, in the log as well (Bharthulwar et al. 2025, arXiv 2511.21011)
                 self.envs.base_env.elapsed_steps.random_(limit)
         self.obs, sums = rollout(self.agent, self.envs, self.storage, self.obs, self.args, self.act, self.get_value)
