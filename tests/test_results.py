@@ -28,6 +28,8 @@ def project(tmp_path, monkeypatch):
     run_script = results.run_script
 
     def run(*command):
+        if "--physics_alone" in command:
+            return "1000\n"
         if command[0] == "python":
             assert command[1] == "ppo.py" and ppo.main([*command[2:]]) == 0
         else:
@@ -55,7 +57,8 @@ def test_a_row_of_the_table(project, capsys):
     (run_dir,) = (project / "runs").iterdir()
     trained = [x["rollout_time"] + x["update_time"] for x in read_metrics(run_dir) if x["kind"] == "train"]
     assert row["training_seconds"] == pytest.approx(sum(trained), abs=0.1)
-    assert [steps for steps, _, _ in row["curve"]] == [0, 320, 640]
+    assert [steps for steps, *_ in row["curve"]] == [0, 320, 640] and row["physics_alone"] == 1000
+    assert all(0 <= at_end <= once <= 1 for _, _, once, at_end in row["curve"])
 
     results.main(command)  # the row is there
     assert out.read_text().count("\n") == 1
@@ -65,21 +68,21 @@ def test_a_row_of_the_table(project, capsys):
     assert (run_dir / "last.pt").stat().st_mtime == modified
 
     results.main([*command, "--table"])
-    assert "1 recipes, 0 solved" in capsys.readouterr().out
+    assert "1 tasks; every seed solves 0 at some step, and 0 at the end" in capsys.readouterr().out
     before, _, _, header, _, line, _, _, after = (project / "README.md").read_text().splitlines()
     assert (before, after) == ("before", "after") and line.count("|") == header.count("|")
-    assert (project / "results.png").stat().st_size > 10_000
+    assert not (project / "results.png").exists(), "nothing was learned in 640 steps"
 
 
-def make_row(recipe, seed, success=None, reward=0.5):
+def make_row(recipe, seed, success=None, reward=0.5, at_end=0.0):
     metrics = dict(episode_len=[1000.0])
     metrics["return"] = [1000 * reward, 0.0, 1000.0]
     if success is not None:
-        metrics |= dict(success_once=[success, 0.0, 1.0], success_at_end=[success / 2, 0.0, 1.0])
+        metrics |= dict(success_once=[success, 0.0, 1.0], success_at_end=[at_end, 0.0, 1.0])
     curve = [[100 * i, 60.0 * i, reward * i] for i in range(3)]
     return dict(
-        recipe=recipe, further_flags="", seed=seed, task="Task", steps=200, training_seconds=120.0, runs_at_once=seed,
-        best=metrics, last=metrics, steps_to_nine_tenths_of_the_best=100, curve=curve,
+        recipe=recipe, further_flags="", seed=seed, task=recipe, steps=200, training_seconds=0.2, runs_at_once=seed,
+        physics_alone=2000, best=metrics, last=metrics, steps_to_nine_tenths_of_the_best=100, curve=curve,
     )  # fmt: skip
 
 
@@ -94,16 +97,32 @@ def path(tmp_path):
 def test_a_task_is_solved_if_every_seed_solves_it(path, capsys):
     """By success where the task has it, else by the return."""
     rows = [make_row("push_cube_cpu", seed, success) for seed, success in ((2, 0.95), (1, 0.9), (3, 0.91))]
+    rows += [make_row("push_cube_sb3", seed, 1.0, at_end=1.0) for seed in (1, 2, 3)]  # bold, but no task of ours
+    rows += [make_row("pull_cube_cpu", seed, 1.0, at_end=at_end) for seed, at_end in ((1, 0.9), (2, 0.95), (3, 1.0))]
     rows += [make_row("pick_cube_cpu", seed, success) for seed, success in ((1, 0.95), (2, 0.89), (3, 1))]
     rows += [make_row("lift_peg_upright_cpu", seed, 1.0) for seed in (1, 2)]  # a seed is missing
     rows += [make_row("cartpole_balance_cpu", seed, reward=0.81) for seed in (1, 2, 3)]
     rows += [make_row("hopper_stand_cpu", seed, reward=0.79) for seed in (1, 2, 3)]
     results.write_table(rows, path)
-    assert "5 recipes, 2 solved" in capsys.readouterr().out
+    assert "every seed solves 3 at some step, and 2 at the end" in capsys.readouterr().out
     bold = [line for line in path.read_text().splitlines() if "**" in line]
-    assert len(bold) == 2 and "`push_cube_cpu`" in bold[0] and "810" in bold[1]
-    assert bold[0].endswith("| 100 |")
-    assert "| 0.90, 0.95, 0.91 |" in bold[0] and "| 2.0, ≤ 2.0, ≤ 2.0 |" in bold[0]
+    assert len(bold) == 4 and "| **0.90, 0.95, 0.91** | 0.00, 0.00, 0.00 |" in bold[0] and "`push_cube_sb3`" in bold[1]
+    assert "| **1.00, 1.00, 1.00** | **0.90, 0.95, 1.00** |" in bold[2] and "| **810, 810, 810** |" in bold[3]
+    assert bold[0].endswith("| 100 | 1,000 | 0.50 |")
+
+
+def test_each_recipe_is_followed_by_its_peers():
+    recipes = results.find_recipes()
+    at = recipes.index("push_cube_cpu")
+    assert recipes[at : at + 3] == ["push_cube_cpu", "push_cube_maniskill_cpu", "push_cube_sb3"]
+    assert len(recipes) == len(set(recipes)) and recipes[at + 3] == "pull_cube_cpu"
+
+
+def test_the_picture_has_what_learns(tmp_path):
+    rows = [make_row("push_cube_cpu", seed, 1.0) for seed in (1, 2)] + [make_row("push_cube_sb3", 1, 1.0)]
+    rows += [make_row("stack_cube_cpu", seed, 0.0, reward=0.0) for seed in (1, 2)]
+    results.draw_curves(rows, tmp_path / "results.png")
+    assert (tmp_path / "results.png").stat().st_size > 10_000
 
 
 def test_steps_are_given_only_where_every_run_learned(path):
@@ -127,6 +146,9 @@ def test_rows_are_of_todays_recipes(run_recipe):
     of_the_run = {"seed", "exp_name", "capture_video"}
     of_the_machine = {"num_envs", "num_eval_envs", "num_steps", "num_actors", "shader"}
     for row in rows:
+        if row["recipe"] in results.STABLE_BASELINES3:
+            assert row["task"] == results.STABLE_BASELINES3[row["recipe"]][0]
+            continue
         (script, *flags), _ = run_recipe(row["recipe"], *shlex.split(row["further_flags"]))
         today = asdict({"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script].parse_args(flags))
         for name in today.keys() - of_the_run - of_the_machine:

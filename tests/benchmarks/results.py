@@ -5,6 +5,7 @@ best.pt and last.pt on 256 other episodes, and appends a row a run to results.js
     python tests/benchmarks/results.py --recipes push_cube_cpu --seeds 1 2 3 4 5
     python tests/benchmarks/results.py --at_once 2        # shorter in all; each run's own minutes are upper bounds then
     python tests/benchmarks/results.py --recipes push_cube_cpu --flags="--no-partial_reset"     # rows of their own
+    uv run --group benchmark tests/benchmarks/results.py --recipes push_cube_sb3                # Stable-Baselines3
     python tests/benchmarks/results.py --table              # writes the table in README.md here, and results.png
 
 Stop it at any time: it skips the rows that are there, and resumes a run that was interrupted. To repeat one row:
@@ -32,11 +33,29 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(__file__).resolve().parent
 EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256", "--no-cuda", "--no-capture_video")
+# Runs of sb3.py, to compare with: task, steps, steps from one evaluation to the next, and episodes of an evaluation, as
+# in the recipe.
+STABLE_BASELINES3 = {
+    "push_cube_sb3": ("PushCube-v1", 120_000, 16_000, 64),
+    "pick_cube_sb3": ("PickCube-v1", 400_000, 32_000, 64),
+    "poke_cube_sb3": ("PokeCube-v1", 1_200_000, 32_000, 64),
+    "cartpole_swing_up_sb3": ("MS-CartpoleSwingUp-v1", 400_000, 32_000, 8),
+    "ant_walk_sb3": ("MS-AntWalk-v1", 600_000, 32_000, 8),
+}
 TABLE_STARTS, TABLE_ENDS = "<!-- written by results.py -->", "<!-- end -->"
 
 
 def find_recipes() -> list[str]:
-    return re.findall(r"^(\w+_cpu)\(\)", (ROOT / "examples/recipes.sh").read_text(), re.MULTILINE)
+    """The recipes, each followed by the runs to compare it with."""
+    names = re.findall(r"^(\w+_cpu)\(\)", (ROOT / "examples/recipes.sh").read_text(), re.MULTILINE)
+    own = [name for name in names if not name.endswith("_maniskill_cpu")]
+    peers = {*names, *STABLE_BASELINES3}.difference(own)
+    return [name for recipe in own for name in (recipe, *sorted(x for x in peers if find_own_recipe(x) == recipe))]
+
+
+def find_own_recipe(recipe: str) -> str:
+    """The recipe that a run is compared with: itself, if it is no peer's."""
+    return re.sub("_(maniskill_cpu|sb3)$", "_cpu", recipe)
 
 
 def read_rows(path: Path) -> list[dict]:
@@ -61,12 +80,13 @@ def describe_processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def run_script(*command: str) -> None:
-    """The recipes call `python`: let that be this interpreter."""
+def run_script(*command: str) -> str:
+    """Returns what it printed. The recipes call `python`: let that be this interpreter."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, "PATH": path}, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
+    return done.stdout
 
 
 def train(recipe: str, seed: int, flags: list[str], script: str, num_at_once: int) -> Path:
@@ -74,7 +94,12 @@ def train(recipe: str, seed: int, flags: list[str], script: str, num_at_once: in
     each other."""
     name = "_".join(["results", recipe, str(seed), *(flag.strip("-") for flag in flags)])
     run_dir = ROOT / "runs" / name
-    if (run_dir / "last.pt").exists():
+    if recipe in STABLE_BASELINES3:
+        if not (run_dir / "best.json").exists():
+            names = ("--env_id", "--total_timesteps", "--eval_interval", "--num_eval_episodes")
+            own = [word for flag in zip(names, map(str, STABLE_BASELINES3[recipe])) for word in flag]
+            run_script("python", script, *own, "--seed", str(seed), "--exp_name", name, *flags)
+    elif (run_dir / "last.pt").exists():
         run_script("python", script, "--resume", str(run_dir))
     else:
         own = ["--seed", str(seed), "--exp_name", name, "--no-capture_video"]
@@ -86,10 +111,20 @@ def train(recipe: str, seed: int, flags: list[str], script: str, num_at_once: in
 
 def evaluate(run_dir: Path, script: str, checkpoint: str) -> dict:
     """The metrics of 256 episodes: mean, and ends of the 95% interval."""
-    run_script("python", script, "--checkpoint", str(run_dir / checkpoint), *EVALUATION)
-    found = json.loads((run_dir / "eval.json").read_text())
+    path = run_dir / f"{Path(checkpoint).stem}.json"  # of sb3.py, which evaluates its policies itself
+    if script.startswith("ppo"):
+        run_script("python", script, "--checkpoint", str(run_dir / checkpoint), *EVALUATION)
+        path = run_dir / "eval.json"
+    found = json.loads(path.read_text())
     names = [k for k in ("success_once", "success_at_end", "return", "episode_len") if k in found]
     return {k: [round(x, 4) for x in (found[k], *found.get(f"{k}_interval", ()))] for k in names}
+
+
+def measure_physics(run_dir: Path, num_at_once: int) -> int:
+    """Steps per second of physics alone, now, in as many processes as the run had."""
+    num_processes = max(1, os.cpu_count() // num_at_once)
+    command = ("python", str(FOLDER / "rollout.py"), "--physics_alone", str(num_processes))
+    return int(run_script(*command, "--checkpoint", str(run_dir / "best.pt")))
 
 
 def has_same_weights(run_dir: Path) -> bool:
@@ -115,15 +150,21 @@ def main_metric(metrics: dict) -> str:
 
 
 def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict:
-    script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
+    if recipe in STABLE_BASELINES3:
+        script = str(FOLDER / "sb3.py")
+    else:
+        script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
     commit = find_commit()  # the one that trains; there may be another when the row is written
     run_dir = train(recipe, seed, flags, script, num_at_once)
     about = json.loads((run_dir / "args.json").read_text())
     best = evaluate(run_dir, script, "best.pt")
-    last = best if has_same_weights(run_dir) else evaluate(run_dir, script, "last.pt")
+    is_same = recipe not in STABLE_BASELINES3 and has_same_weights(run_dir)
+    last = best if is_same else evaluate(run_dir, script, "last.pt")
     curve = learning_curve(run_dir, main_metric(best))
-    highest = max(value for _, _, value in curve)
-    steps, seconds, _ = next(point for point in curve if point[2] >= 0.9 * highest)
+    if "success_at_end" in best:
+        curve = [(*point, at_end) for point, (_, _, at_end) in zip(curve, learning_curve(run_dir, "success_at_end"))]
+    highest = max(point[2] for point in curve)
+    steps, seconds, *_ = next(point for point in curve if point[2] >= 0.9 * highest)
     return dict(
         recipe=recipe,
         task=about["args"]["env_id"],
@@ -136,6 +177,8 @@ def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict
         versions=about["versions"],
         steps=curve[-1][0],
         training_seconds=curve[-1][1],
+        # with images, physics is a small part
+        physics_alone=measure_physics(run_dir, num_at_once) if script == "ppo.py" else None,
         best=best,
         last=last,
         steps_to_nine_tenths_of_the_best=steps,
@@ -158,17 +201,17 @@ def group(rows: list[dict]) -> dict[str, list[dict]]:
     return groups
 
 
-def is_solved(row: dict) -> bool:
+def is_solved(row: dict, metric: str) -> bool:
     """Nine of ten episodes succeed; without success, the return is 0.8 of its maximum: 1 at every step."""
     best = row["best"]
-    if "success_once" in best:
-        return best["success_once"][0] >= 0.9
+    if metric in best:
+        return best[metric][0] >= 0.9
     return best["return"][0] >= 0.8 * best["episode_len"][0]
 
 
 def has_learned(row: dict) -> bool:
     """The success rate rose by 0.2 (less may be chance) or, without success, the return more than doubled."""
-    values = [value for _, _, value in row["curve"]]
+    values = [point[2] for point in row["curve"]]
     if "success_once" in row["best"]:
         return max(values) - values[0] >= 0.2
     return max(values) > 2 * values[0]
@@ -187,44 +230,57 @@ def describe_minutes(run: dict) -> str:
 
 
 def write_table(rows: list[dict], path: Path) -> None:
-    """Replace the table in this file."""
-    names = ("recipe", "task", "steps", "seeds", "minutes", "success once", "success at end", "return", "last policy")
-    table = [(*names, "90% after"), ["---"] * 10]
-    groups, solved = group(rows), set()
-    for name, runs in groups.items():
-        name = f"`{name}`"
+    """Replace the table in this file. What every seed solves is bold."""
+    names = ("recipe", "task", "steps", "seeds", "success once", "success at end", "return", "last policy", "90% after")
+    table = [(*names, "steps/s", "of physics alone"), ["---"] * 11]
+    solved = {"success_once": set(), "success_at_end": set()}
+    for name, runs in group(rows).items():
+        task, means = runs[0]["task"].rpartition(":")[2], {}
+        for metric in ("success_once", "success_at_end", "return"):
+            means[metric] = join_seeds(runs, "best", metric)
+        for metric, tasks in solved.items():
+            if len(runs) >= 3 and all(is_solved(run, metric) for run in runs):
+                shown = metric if metric in runs[0]["best"] else "return"
+                means[shown] = f"**{means[shown].strip('*')}**"
+                if find_own_recipe(runs[0]["recipe"]) == runs[0]["recipe"]:
+                    tasks.add(task)
         steps_to_nine_tenths = [run["steps_to_nine_tenths_of_the_best"] for run in runs]
         all_learned = all(has_learned(run) for run in runs)
-        if len(runs) >= 3 and all(map(is_solved, runs)):
-            name = f"**{name}**"
-            solved.add(runs[0]["recipe"])
+        speeds = [run["steps"] / run["training_seconds"] for run in runs]
+        ratios = [x / run["physics_alone"] for x, run in zip(speeds, runs) if run.get("physics_alone")]
         line = [
-            name,
-            runs[0]["task"].rpartition(":")[2],
+            f"`{name}`",
+            task,
             f"{max(run['steps'] for run in runs):,}",
             ", ".join(str(run["seed"]) for run in runs),
-            ", ".join(describe_minutes(run) for run in runs),
-            join_seeds(runs, "best", "success_once"),
-            join_seeds(runs, "best", "success_at_end"),
-            join_seeds(runs, "best", "return"),
+            *means.values(),
             join_seeds(runs, "last", main_metric(runs[0]["last"])),
             f"{statistics.median(steps_to_nine_tenths):,.0f}" if all_learned else "",
+            f"{statistics.median(speeds):,.0f}",
+            f"{statistics.median(ratios):.2f}" if ratios else "",
         ]
         table.append(line)
     lines = [f"| {' | '.join(line)} |" for line in table]
     text = path.read_text()
     before, after = text.partition(TABLE_STARTS)[0], text.partition(TABLE_ENDS)[2]
     path.write_text("\n".join([before + TABLE_STARTS, "", *lines, "", TABLE_ENDS]) + after)
-    recipes = {row["recipe"] for row in rows}
-    print(f"{path}: {len(recipes)} recipes, {len(solved)} solved with every seed")
+    once, at_end = (len(tasks) for tasks in solved.values())
+    num_tasks = len({row["task"] for row in rows})
+    print(f"{path}: {num_tasks} tasks; every seed solves {once} at some step, and {at_end} at the end")
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """A picture a recipe, of its rows with the fewest further flags: the mean of the seeds, and their range."""
-    groups = {}
+    """A picture a recipe that learns, of its rows with the fewest further flags: the mean of the seeds and their range,
+    of success at some step and at the end, or of the return. Peers are grey."""
+    groups, peers = {}, defaultdict(list)
     for runs in group(rows).values():
         recipe = runs[0]["recipe"]
-        groups[recipe] = min(groups.get(recipe, runs), runs, key=lambda runs: len(runs[0]["further_flags"]))
+        if find_own_recipe(recipe) != recipe:
+            peers[find_own_recipe(recipe)].append(runs)
+        elif any(map(has_learned, runs)):
+            groups[recipe] = min(groups.get(recipe, runs), runs, key=lambda runs: len(runs[0]["further_flags"]))
+    if not groups:
+        return
     columns = min(5, len(groups))
     lines = math.ceil(len(groups) / columns)
     figure = Figure(figsize=(2.6 * columns, 2.1 * lines), layout="constrained")
@@ -232,16 +288,12 @@ def draw_curves(rows: list[dict], path: Path) -> None:
     for axis in axes[len(groups) :]:
         axis.axis("off")
     for axis, (recipe, runs) in zip(axes, groups.items()):
-        points = defaultdict(list)
-        for run in runs:
-            for steps, _, value in run["curve"]:
-                points[steps / 1000].append(value)
-        x = [steps for steps, values in points.items() if len(values) == len(runs)]  # where all seeds were evaluated
-        values = [points[steps] for steps in x]
-        axis.fill_between(x, [min(v) for v in values], [max(v) for v in values], alpha=0.3)
-        axis.plot(x, [statistics.mean(v) for v in values])
-        name = f"{recipe.removesuffix('_cpu')} {runs[0]['further_flags']}"
-        axis.set_title(name.replace(" --", "\n--"), fontsize=8)
+        for peer, style in zip(peers[recipe], ("-", "--")):
+            draw_mean(axis, peer, 2, color="grey", linestyle=style)
+        draw_mean(axis, runs, 2, color="C0")
+        if all(len(point) > 3 for run in runs for point in run["curve"]):
+            draw_mean(axis, runs, 3, color="C1")
+        axis.set_title(recipe.removesuffix("_cpu"), fontsize=8)
         axis.tick_params(labelsize=7)
         is_rate = "success_once" in runs[0]["best"]
         axis.set_ylim(0, 1.03 if is_rate else None)
@@ -249,6 +301,20 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         axis.grid(alpha=0.3)
     figure.supxlabel("thousand environment steps", fontsize=8)
     figure.savefig(path, dpi=100)
+
+
+def draw_mean(axis, runs: list[dict], column: int, **style) -> None:
+    """The mean of one column of the runs' curves, and their range, where all of them were evaluated."""
+    points = defaultdict(list)
+    for run in runs:
+        for point in run["curve"]:
+            points[point[0] / 1000].append(point[column])
+    x = [steps for steps, values in points.items() if len(values) == len(runs)]
+    values = [points[steps] for steps in x]
+    axis.fill_between(
+        x, [min(v) for v in values], [max(v) for v in values], alpha=0.2, color=style["color"], linewidth=0
+    )
+    axis.plot(x, [statistics.mean(v) for v in values], **style)
 
 
 def main(argv: list[str]) -> None:

@@ -3,6 +3,7 @@ compared with physics alone and with another version of the scripts.
 
     uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt
     uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt --base ../other-worktree
+    uv run tests/benchmarks/rollout.py --checkpoint runs/NAME/best.pt --physics_alone 1    # one process; a number
 
 The candidates take turns, with several repetitions each, because the speed of a shared machine drifts: compare ratios.
 
@@ -105,7 +106,7 @@ def physics_alone(index, num_actors, checkpoint, barrier, queue):
     agent = ppo.Agent(actor.envs.single_observation_space, actor.envs.single_action_space, args)
     agent.load_state_dict(ppo.load_checkpoint(checkpoint)["agent"])
     spaces, cpu = (actor.envs.single_observation_space, actor.envs.single_action_space), torch.device("cpu")
-    actor.receive(agent, ppo.make_storage(*spaces, args, cpu, cpu))
+    actor.receive(agent, ppo.make_storage(agent, *spaces, args, cpu))
     actor.rollout(0, is_first=True)
     recorder = Recorder(actor.envs.base_env.scene.px)
     actor.rollout(1, is_first=False)
@@ -118,12 +119,12 @@ def physics_alone(index, num_actors, checkpoint, barrier, queue):
     actor.close()
 
 
-def physics_on_all_cores(checkpoint):
-    """Returns the steps per second of all cores together."""
-    context, cores = mp.get_context("spawn"), ppo.num_cores()
-    barrier, queue = context.Barrier(cores), context.Queue()
-    arguments = (cores, checkpoint, barrier, queue)
-    processes = [context.Process(target=physics_alone, args=(i, *arguments)) for i in range(cores)]
+def physics_of_processes(num_actors, checkpoint):
+    """Returns the steps per second of all processes together."""
+    context = mp.get_context("spawn")
+    barrier, queue = context.Barrier(num_actors), context.Queue()
+    arguments = (num_actors, checkpoint, barrier, queue)
+    processes = [context.Process(target=physics_alone, args=(i, *arguments)) for i in range(num_actors)]
     for process in processes:
         process.start()
     rate = sum(queue.get() for _ in processes)
@@ -138,7 +139,13 @@ def main():
     parser.add_argument("--base", type=os.path.abspath)
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=12)
+    parser.add_argument("--physics_alone", type=int, metavar="N", help="measure only this, with N processes")
     options = parser.parse_args()
+    if options.physics_alone:
+        with contextlib.redirect_stdout(sys.stderr):
+            rate = physics_of_processes(options.physics_alone, options.checkpoint)
+        print(round(rate))
+        return
 
     env_id = ppo.load_checkpoint(options.checkpoint)["args"]["env_id"]
     script = Path(ppo.__file__)
@@ -147,7 +154,7 @@ def main():
         "batch": lambda: random_actions(env_id, 16, 60),
         "batch of 32": lambda: random_actions(env_id, 32, 30),
         "rollout phase": lambda: rollout_phase(script, options.checkpoint, options.iterations),
-        "physics alone": lambda: physics_on_all_cores(options.checkpoint),
+        "physics alone": lambda: physics_of_processes(ppo.num_cores(), options.checkpoint),
     }
     if options.base:
         base = Path(options.base) / "ppo.py"
