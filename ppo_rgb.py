@@ -1172,6 +1172,9 @@ def seed_all(*numbers: int) -> None:
 
 
 # ----- Batched CPU simulation -----------------------------------------------------------------------------------------
+MAX_SCENES_OF_PROCESS = 950  # each takes one of a process's 1,024 thread-local keys, and PhysX does not check
+
+
 class Array:
     """Stands for SAPIEN's CUDA arrays, which ManiSkill reads and writes as .torch()."""
 
@@ -2046,8 +2049,10 @@ def parse_args(argv: list[str]) -> Args:
     if args.total_timesteps is None:
         args.total_timesteps = NUM_ITERATIONS * args.batch_size
     if args.num_actors is None:
-        cores = num_cores() * WORLD_SIZE if args.sim_backend == "physx_cpu" else WORLD_SIZE
-        args.num_actors = max(1, min(cores, args.num_envs))
+        args.num_actors = WORLD_SIZE
+        if args.sim_backend == "physx_cpu":
+            needed = math.ceil((args.num_envs + args.num_eval_envs) / WORLD_SIZE / MAX_SCENES_OF_PROCESS)
+            args.num_actors = max(1, min(max(num_cores(), needed) * WORLD_SIZE, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
     if args.resume is not None:
@@ -2151,6 +2156,9 @@ def check_simulation(args: Args) -> None:
     on_gpu = args.sim_backend != "physx_cpu"
     if on_gpu and args.num_actors > WORLD_SIZE:
         fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
+    if not on_gpu and args.num_envs + args.num_eval_envs > args.num_actors * MAX_SCENES_OF_PROCESS:
+        fail(f"--num_envs {args.num_envs}, --num_eval_envs {args.num_eval_envs}: on a CPU, one process simulates at "
+             f"most {MAX_SCENES_OF_PROCESS} environments, and --num_actors is {args.num_actors}")  # fmt: skip
     if on_gpu and (args.shader or "").startswith("rt"):
         fail(f"--shader {args.shader}: ray tracing needs CPU simulation: --sim_backend physx_cpu")
     if on_gpu and args.exact_resume:

@@ -575,6 +575,21 @@ def test_reconfiguring_and_closing_free_memory():
     assert not any(ref() for ref in old)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the number of keys is Linux's")
+def test_as_many_scenes_as_allowed_leave_thread_local_keys():
+    """Beyond the last key, PhysX writes to one that is not its own: Python then aborts when it ends."""
+    code = """
+import ctypes, ppo
+scenes = [ppo.physx.PhysxCpuSystem() for _ in range(ppo.MAX_SCENES_OF_PROCESS)]
+key, count = ctypes.c_uint(), 0
+while ctypes.CDLL(None).pthread_key_create(ctypes.byref(key), None) == 0:
+    count += 1
+print(count)"""
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert 20 < int(run.stdout) < 200, run.stderr
+
+
 def test_recorded_trajectories(build, tmp_path):
     """RecordEpisode writes an episode for each row. A replay of its actions from its first state ends the same way."""
     env = build("PickCube-v1", 3)
