@@ -305,6 +305,7 @@ CPU_DEFAULTS = dict(
 GPU_BATCH_SIZE = 12800  # steps of an iteration, unless num_steps is given
 CPU_BATCH_SIZE = 1600
 NUM_ITERATIONS = 150  # unless total_timesteps is given
+MIN_CPU_ENVS = 32
 CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 512  # with more, an iteration has more steps than PPO can use
 UPDATE_THREADS_PER_CORE = 1.0  # in ppo.py, with its small layers, half of them are faster
 TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
@@ -2030,7 +2031,8 @@ def parse_args(argv: list[str]) -> Args:
     parse = partial(tyro.cli, Args, prog=SCRIPT.name, description=description)
     given, default = parse(args=[arg for arg in argv if arg not in ("-h", "--help")]), Args()
     if choose_backend(given) == "physx_cpu":
-        num_envs = min(CPU_ENVS_PER_CORE * num_cores(), MAX_CPU_ENVS // WORLD_SIZE) * WORLD_SIZE
+        num_envs = max(CPU_ENVS_PER_CORE * num_cores(), MIN_CPU_ENVS // WORLD_SIZE)
+        num_envs = min(num_envs, MAX_CPU_ENVS // WORLD_SIZE) * WORLD_SIZE
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")

@@ -123,7 +123,7 @@ def test_commands_for_the_peers_scripts_parse(trained):
 
 @pytest.mark.parametrize(
     "cores, num_envs, num_steps",
-    [(1, 32, 50), (2, 64, 25), (4, 128, 12), (8, 256, 6), (16, 512, 5), (32, 512, 5), (64, 512, 5)],
+    [(1, 128, 12), (2, 128, 12), (4, 128, 12), (8, 256, 6), (16, 512, 5), (32, 512, 5), (64, 512, 5)],
 )
 def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     """Every core simulates. With many cores, an iteration still has few steps, so that there are enough iterations."""

@@ -7,7 +7,7 @@ shared machine drifts: compare ratios, not absolute figures. Both learners have 
 for policy and one for value), minibatch size, epochs and batch. Neither has a target KL, and both have a
 fixed learning rate. The candidates:
 
-  ppo.py            its defaults: one process for each core, a batch of 32 environments in each
+  ppo.py            its defaults: one process for each core, a share of the batch of environments in each
   SB3               Stable-Baselines3's PPO, 8 environments in 8 subprocesses (SubprocVecEnv)
   ppo.py, loaded    ppo.py while two other processes run endless loops
 """
