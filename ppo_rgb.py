@@ -1173,7 +1173,7 @@ def seed_all(*numbers: int) -> None:
 
 
 # ----- Batched CPU simulation -----------------------------------------------------------------------------------------
-MAX_SCENES_OF_PROCESS = 950  # each takes one of a process's 1,024 thread-local keys, and PhysX does not check
+MAX_SCENES_OF_PROCESS = 800  # each takes one of 1,024 thread-local keys (torch takes some); PhysX does not check
 
 
 class Array:

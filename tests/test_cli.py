@@ -135,7 +135,7 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
     assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations == 75 and args.num_steps == 5
     assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
-    assert ppo.parse_args(["--no-cuda", "--num_envs", "4096"]).num_actors == max(cores, 5), "950 in a process"
+    assert ppo.parse_args(["--no-cuda", "--num_envs", "4096"]).num_actors == max(cores, 6), "800 in a process"
     assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
 
 

@@ -34,7 +34,7 @@ import ppo_rgb
         ("--num_envs 0", "num_envs"),
         ("--num_actors 0", "num_actors"),
         ("--num_envs 2 --num_actors 3", "--num_actors 3: there are 2 environments"),
-        ("--num_eval_envs 950", "--num_eval_envs 950: on a CPU, one process simulates at most 950"),
+        ("--num_eval_envs 800", "--num_eval_envs 800: on a CPU, one process simulates at most 800"),
         ("--reconfiguration_freq 1 --num_envs 2 --num_actors 1", "--no-partial_reset"),
         ("--num_steps -1", "num_steps"),
         ("--learning_rate nan", "learning_rate"),
