@@ -90,7 +90,7 @@ class Evaluation(BaseCallback):
     def __init__(self, args, eval_envs, interval, file):
         super().__init__()
         self.args, self.eval_envs, self.interval, self.file = args, eval_envs, interval, file
-        self.best_score, self.next_step, self.seconds, self.start = [-1.0], 0, 0.0, None
+        self.best_score, self.next_step, self.start = [-1.0], 0, None
 
     def _on_step(self):
         return True
@@ -113,6 +113,7 @@ class Evaluation(BaseCallback):
         self.write(kind="eval", **{k: v.mean().item() for k, v in episodes.items()})
         if ppo.score(episodes) > self.best_score:
             self.best_score, self.best = ppo.score(episodes), policy.state()
+        ppo.seed_all(self.args.seed, self.num_timesteps)  # else each evaluation would leave the same random numbers
 
     def write(self, **row):
         self.file.write(json.dumps(dict(global_step=self.num_timesteps) | row) + "\n")
