@@ -36,6 +36,7 @@ import inspect
 import json
 import math
 import os
+import pickle
 import platform
 import random
 import re
@@ -1592,15 +1593,17 @@ class Actor:
                 envs.close()
 
 
-def run_in_actor(method: str, *arguments):
-    """Runs in an actor's process. The first call is "build", with the arguments of Actor."""
+def run_in_actor(method: str, *arguments) -> bytes:
+    """Runs in an actor's process. The first call is "build", with the arguments of Actor. Returns the pickled result:
+    tensors themselves would go through shared memory, and a process that is killed meanwhile leaves a file there."""
     global ACTOR
     if method != "build":
-        return getattr(ACTOR, method)(*arguments)
+        return pickle.dumps(getattr(ACTOR, method)(*arguments))
     torch.set_num_threads(1)
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # ManiSkill would save the random state of each GPU, and take memory there
     threading.Thread(target=end_with_main_process, daemon=True).start()
     ACTOR = Actor(*arguments)
+    return pickle.dumps(None)
 
 
 def end_with_main_process() -> None:
@@ -1649,7 +1652,8 @@ class Actors:
         """Call a method of all actors at the same time; returns their results in order."""
         try:
             futures = [pool.submit(run_in_actor, method, *arguments) for pool in self.pools]
-            return [getattr(self.actor0, method)(*arguments), *(future.result() for future in self.built + futures)]
+            own = getattr(self.actor0, method)(*arguments)
+            return [own, *(pickle.loads(future.result()) for future in self.built + futures)]
         except BrokenProcessPool:
             raise RunError("the process of an actor died (killed? out of memory?)") from None
 

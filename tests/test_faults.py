@@ -368,14 +368,8 @@ TINY = ("--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 1, "--num_eval_ep
 
 
 def shared_files():
-    """Ignores semaphores, which other tests create at the same time, and files without memory: an actor that is killed
-    while it sends a tensor may leave one."""
-    found = set()
-    for path in Path("/dev/shm").glob("*"):
-        with contextlib.suppress(FileNotFoundError):  # torch unlinks its files at once
-            if not path.name.startswith("sem.mp-") and path.stat().st_size > 0:
-                found.add(path)
-    return found
+    """Ignores semaphores: other tests create them at the same time."""
+    return {path for path in Path("/dev/shm").glob("*") if not path.name.startswith("sem.mp-")}
 
 
 @pytest.fixture
