@@ -13,6 +13,15 @@ from matplotlib.figure import Figure
 from results import learning_curve
 
 
+def draw_frames(axes, images) -> None:
+    """A frame on each axis, from the first to the last."""
+    chosen = np.linspace(0, len(images) - 1, len(axes)).round().astype(int)
+    for axis, index in zip(axes, chosen):
+        axis.imshow(images[index])
+        axis.set_title(f"step {index}", fontsize=8)
+        axis.axis("off")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out")
@@ -38,12 +47,7 @@ def main():
         axis.grid(alpha=0.3)
     above.suptitle(args["env_id"])
     for subfigure in below:
-        images = iio.imread(options.video)
-        chosen = np.linspace(0, len(images) - 1, options.frames).round().astype(int)
-        for axis, index in zip(subfigure.subplots(1, options.frames), chosen):
-            axis.imshow(images[index])
-            axis.set_title(f"step {index}", fontsize=8)
-            axis.axis("off")
+        draw_frames(subfigure.subplots(1, options.frames), iio.imread(options.video))
     figure.savefig(options.out, dpi=100)
 
 

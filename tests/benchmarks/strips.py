@@ -8,8 +8,8 @@ import contextlib
 import sys
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
+from picture import draw_frames
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo
@@ -46,11 +46,8 @@ def main():
     axes = figure.subplots(len(options.runs), options.frames, squeeze=False)
     for row, run in zip(axes, options.runs):
         task, frames = film(run, options.seed)
-        chosen = np.linspace(0, len(frames) - 1, options.frames).round().astype(int)
-        for axis, index in zip(row, chosen):
-            axis.imshow(frames[index])
-            axis.set_title(f"{task if index == 0 else 'step'} {index or ''}", fontsize=8)
-            axis.axis("off")
+        draw_frames(row, frames)
+        row[0].set_title(task, fontsize=8)
     figure.savefig(options.out, dpi=80)
 
 
