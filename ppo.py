@@ -198,7 +198,7 @@ class Args:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: fewer if there are more environments, at least 5)"""
     anneal_lr: bool = True
-    """lower the learning rate, or desired_kl if there is one, linearly to zero over the run"""
+    """lower learning rates linearly to zero over the run; if desired_kl adapts one, lower desired_kl instead"""
     gamma: float = 0.9
     """discount factor"""
     gae_lambda: float = 0.8
