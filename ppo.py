@@ -198,7 +198,7 @@ class Args:
     num_steps: Optional[int] = None
     """steps in each environment per iteration (None: fewer if there are more environments, at least 5)"""
     anneal_lr: bool = True
-    """lower learning rates linearly to zero over the run; if desired_kl adapts one, lower desired_kl instead"""
+    """lower the learning rate linearly to zero over the run (with desired_kl: that of the critic only)"""
     gamma: float = 0.9
     """discount factor"""
     gae_lambda: float = 0.8
@@ -282,8 +282,10 @@ class Args:
         return self.total_timesteps // self.batch_size
 
 
-CPU_DEFAULTS = dict(eval_freq=10)  # on a GPU, a step takes as long for all environments as for a few
-BATCH_SIZE = 1600  # steps of an iteration, unless num_steps is given
+# On a CPU, an iteration has fewer steps: too few to change the policy as much. Then its noise has to fall faster.
+CPU_DEFAULTS = dict(desired_kl=0.05, logstd_lr_factor=20.0, eval_freq=10)
+GPU_BATCH_SIZE = 4096  # steps of an iteration, unless num_steps is given
+CPU_BATCH_SIZE = 1600
 NUM_ITERATIONS = 75  # unless total_timesteps is given
 MIN_CPU_ENVS = 128  # with fewer, a step takes longer; with 32, PPO learns PickCube-v1 later
 CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 512  # with more, an iteration has more steps than PPO can use
@@ -469,11 +471,11 @@ def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.
     special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
     actor = [p for p in agent.parameters() if id(p) not in special]
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
-    desired_kl = None if args.desired_kl is None else torch.tensor(args.desired_kl, device=device)
+    adapts = args.desired_kl is not None
     groups = [
-        dict(params=actor, initial_lr=args.learning_rate, desired_kl=desired_kl),
-        dict(params=[agent.actor_logstd], initial_lr=args.learning_rate * args.logstd_lr_factor, desired_kl=desired_kl),
-        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, desired_kl=None),
+        dict(params=actor, initial_lr=args.learning_rate, adapts=adapts),
+        dict(params=[agent.actor_logstd], initial_lr=args.learning_rate * args.logstd_lr_factor, adapts=adapts),
+        dict(params=[*agent.critic.parameters()], initial_lr=critic_lr, adapts=False),
     ]
     for group in groups:
         group["lr"] = torch.tensor(group["initial_lr"], device=device)  # where a CUDA graph reads it
@@ -485,18 +487,17 @@ def load_optimizer(optimizer: torch.optim.Optimizer, saved: dict) -> None:
     flags = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
     optimizer.load_state_dict(saved)
     for group, flag in zip(optimizer.param_groups, flags):
-        both_adapt = group["desired_kl"] is not None and flag["desired_kl"] is not None
-        if both_adapt and group["initial_lr"] == flag["initial_lr"]:
+        if group["adapts"] and flag["adapts"] and group["initial_lr"] == flag["initial_lr"]:
             flag["lr"].copy_(group["lr"])
         group.update(flag)
 
 
-def adapt_learning_rate(optimizer, kl: torch.Tensor) -> None:
+def adapt_learning_rate(optimizer, kl: torch.Tensor, desired_kl: float) -> None:
     """Lower the policy's learning rate if the KL divergence is more than twice the desired one, and raise it if it is
     less than half of it (Rudin et al. 2022, arXiv 2109.11978), within 0.01 to 10 times the initial one."""
+    factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
     for group in optimizer.param_groups:
-        if (desired_kl := group["desired_kl"]) is not None:
-            factor = torch.where(kl > 2 * desired_kl, 1 / 1.5, torch.where(kl < desired_kl / 2, 1.5, 1.0))
+        if group["adapts"]:
             group["lr"].mul_(factor).clamp_(group["initial_lr"] / 100, group["initial_lr"] * 10)
 
 
@@ -534,7 +535,7 @@ def update_minibatch(agent, optimizer, args, obs, actions, logprobs, advantages,
     with torch.no_grad():
         approx_kl = ((ratio - 1) - logratio).mean()  # estimator k3 of http://joschu.net/blog/kl-approx.html
         if args.desired_kl is not None:
-            adapt_learning_rate(optimizer, all_reduce_mean(approx_kl))
+            adapt_learning_rate(optimizer, all_reduce_mean(approx_kl), args.desired_kl)
         clipfrac = ((ratio - 1).abs() > args.clip_coef).float().mean()
         return torch.stack([policy_loss, value_loss, entropy, approx_kl, clipfrac, grad_norm])
 
@@ -653,12 +654,9 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
         # --- update: update_epochs times over the batch, in shuffled minibatches ---
         torch.set_num_threads(max(1, int(num_cores() * UPDATE_THREADS_PER_CORE)))
         if args.anneal_lr:
-            remaining = 1 - iteration / args.num_iterations
-            for group in optimizer.param_groups:  # fill tensors: Python numbers are frozen in a CUDA graph
-                if group["desired_kl"] is None:
-                    group["lr"].fill_(group["initial_lr"] * remaining)
-                else:
-                    group["desired_kl"].fill_(args.desired_kl * remaining)
+            for group in optimizer.param_groups:
+                if not group["adapts"]:  # fill a tensor: Python numbers are frozen in a CUDA graph
+                    group["lr"].fill_(group["initial_lr"] * (1 - iteration / args.num_iterations))
         update_metrics = []
         for _ in range(args.update_epochs):
             torch.randperm(local.batch_size, out=permutation)
@@ -1851,7 +1849,8 @@ def parse_args(argv: list[str]) -> Args:
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if args.num_steps is None:
-        args.num_steps = max(5, BATCH_SIZE // max(1, args.num_envs))
+        batch_size = CPU_BATCH_SIZE if args.sim_backend == "physx_cpu" else GPU_BATCH_SIZE
+        args.num_steps = max(5, batch_size // max(1, args.num_envs))
     if args.total_timesteps is None:
         args.total_timesteps = NUM_ITERATIONS * args.batch_size
     if args.num_actors is None:

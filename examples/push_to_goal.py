@@ -2,9 +2,9 @@
 
     python ppo.py --env_id examples.push_to_goal:PushToGoal-v1 --total_timesteps 400000 --layer_norm --logstd_final -3
 
-Of 256 other episodes, 0.93 to 0.97 then succeeded at some step, and 0.89 to 0.93 at the last one (seeds 4 to 6, an
-earlier version). Training episodes go on after success (--success_steps), so that the policy learns to leave the cube
-there. With the last two flags, it stops just short of the goal less often.
+Of 256 other episodes, 0.93 to 0.97 then succeeded at some step, and 0.89 to 0.93 at the last one (seeds 4 to 6).
+Training episodes go on after success (--success_steps), so that the policy learns to leave the cube there. With
+the last two flags, it stops just short of the goal less often.
 
 A task defines five things: what is in the scene (`_load_scene`, once), how an episode starts (`_initialize_episode`, at
 each reset, for the environments that reset), what success and failure are (`evaluate`), what the policy sees besides

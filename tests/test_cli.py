@@ -131,7 +131,7 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     args = ppo.parse_args(["--no-cuda"])
     assert (args.sim_backend, args.num_actors) == ("physx_cpu", cores)
     assert (args.num_envs, args.num_eval_envs, args.num_steps) == (num_envs, num_envs, num_steps)
-    assert args.num_iterations == 75 and args.batch_size <= 2560
+    assert args.num_iterations == 75 and args.batch_size <= 2560 and args.desired_kl == 0.05
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
     assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations == 75 and args.num_steps == 5
     assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
@@ -139,7 +139,7 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
 
 
-@pytest.mark.parametrize("num_envs, num_steps", [(512, 5), (4096, 5), (16, 100)])
+@pytest.mark.parametrize("num_envs, num_steps", [(512, 8), (4096, 5), (16, 256)])
 def test_defaults_of_a_gpu(monkeypatch, num_envs, num_steps):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     args = ppo.parse_args(["--num_envs", str(num_envs)])

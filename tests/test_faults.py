@@ -350,7 +350,7 @@ def test_learning_rates_of_a_resumed_run(device):
     args = ppo.Args(learning_rate=1e-3, desired_kl=0.01, logstd_lr_factor=1.0)
     agent = ppo.Agent(box(4), ACTIONS, args).to(device)
     saved = ppo.make_optimizer(agent, args, device)
-    ppo.adapt_learning_rate(saved, torch.tensor(1.0, device=device))
+    ppo.adapt_learning_rate(saved, torch.tensor(1.0, device=device), 0.01)
     saved.param_groups[2]["lr"].fill_(1e-7)
     state = saved.state_dict()
     for flags, rates in ((dict(), [1e-3 / 1.5, 1e-3 / 1.5, 1e-3]), (dict(learning_rate=2e-3), [2e-3] * 3)):

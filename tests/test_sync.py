@@ -12,7 +12,7 @@ import ppo_rgb
 
 # what differs above the banner; everything else that both have there must be equal
 DIFFERENT = {"Args", "Agent", "check_observations", "make_env", "rollout", "update_minibatch"}
-DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "NUM_ITERATIONS", "FIXED_FLAGS", "LIMITS"}
+DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "GPU_BATCH_SIZE", "NUM_ITERATIONS", "FIXED_FLAGS", "LIMITS"}
 DIFFERENT_CONSTANTS |= {"UPDATE_THREADS_PER_CORE", "MIN_CPU_ENVS"}
 DIFFERENT_HELP = {"obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs"}
 
@@ -82,7 +82,7 @@ def test_flags_that_both_have_are_the_same():
     assert {k for k in shared if a[k].type != b[k].type} == {"shader"}
     different = {"obs_mode", "num_envs", "render_mode", "shader", "learning_rate", "anneal_lr", "gamma", "gae_lambda"}
     different |= {"num_minibatches", "update_epochs", "target_kl", "desired_kl", "norm_obs", "logstd_lr_factor"}
-    different |= {"staggered_resets", "num_steps"}
+    different |= {"staggered_resets"}
     assert {k for k in shared if a[k].default != b[k].default} == different
     x, y = help_texts("ppo.py"), help_texts("ppo_rgb.py")
     assert x.keys() == a.keys() and y.keys() == b.keys(), "every flag has a help text"
