@@ -37,7 +37,7 @@ EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256
 # in the recipe.
 STABLE_BASELINES3 = {
     "push_cube_sb3": ("PushCube-v1", 120_000, 16_000, 64),
-    "pick_cube_sb3": ("PickCube-v1", 900_000, 41_000, 64),
+    "pick_cube_sb3": ("PickCube-v1", 600_000, 31_000, 64),
     "poke_cube_sb3": ("PokeCube-v1", 1_200_000, 32_000, 64),
     "cartpole_swing_up_sb3": ("MS-CartpoleSwingUp-v1", 400_000, 32_000, 8),
     "ant_walk_sb3": ("MS-AntWalk-v1", 600_000, 32_000, 8),
