@@ -25,7 +25,7 @@ peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timeste
 two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
-curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 250000 "$@"; }
+curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 400000 "$@"; }
 
 # Larger steps of the policy and a standard deviation that learns more slowly: with the defaults, one seed of four held the
 # cube and did not bring it to the goal in 400,000 steps.
