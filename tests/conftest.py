@@ -235,24 +235,6 @@ def refused(arguments, capsys, script=ppo):
     return output.err
 
 
-@pytest.fixture
-def run_recipe(tmp_path, monkeypatch):
-    """A function that runs examples/recipes.sh with a stand-in for `python`. It returns the words of the command that
-    the recipe would have run, and what was printed as an error."""
-    stand_in = tmp_path / "bin/python"
-    stand_in.parent.mkdir()
-    stand_in.write_text('#!/bin/sh\nfor x in "$@"; do printf "%s\\0" "$x"; done\n')
-    stand_in.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{stand_in.parent}:{os.environ['PATH']}")
-
-    def run(*arguments):
-        command = ["bash", str(ROOT / "examples/recipes.sh"), *arguments]
-        process = subprocess.run(command, capture_output=True, text=True)
-        return process.stdout.split("\0")[:-1], process.stderr
-
-    return run
-
-
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """A short run with two actors on the CPU, made once: its folder, its stdout and its stderr."""

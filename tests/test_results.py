@@ -25,15 +25,12 @@ def project(tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text(f"before\n{results.TABLE_STARTS}\nold\n{results.TABLE_ENDS}\nafter\n")
     monkeypatch.setattr(results, "ROOT", tmp_path)
     monkeypatch.setattr(results, "EVALUATION", [x.replace("256", "3") for x in results.EVALUATION])
-    run_script = results.run_script
+    monkeypatch.chdir(tmp_path)
 
     def run(*command):
         if "--physics_alone" in command:
             return "1000\n"
-        if command[0] == "python":
-            assert command[1] == "ppo.py" and ppo.main([*command[2:]]) == 0
-        else:
-            run_script(*command)
+        assert command[:2] == ("python", "ppo.py") and ppo.main([*command[2:]]) == 0
 
     monkeypatch.setattr(results, "run_script", run)
     monkeypatch.setattr("signal.signal", lambda *args: None)  # a thread may not set handlers
@@ -64,7 +61,7 @@ def test_a_row_of_the_table(project, capsys):
     assert out.read_text().count("\n") == 1
     modified = (run_dir / "last.pt").stat().st_mtime
     with pytest.raises(SystemExit, match="0"):  # so is the run
-        results.train("push_cube_cpu", 2, shlex.split(FLAGS), "ppo.py", 1)
+        results.train("push_cube_cpu", 2, shlex.split(FLAGS), 1)
     assert (run_dir / "last.pt").stat().st_mtime == modified
 
     results.main([*command, "--table"])
@@ -114,7 +111,7 @@ def test_a_task_is_solved_if_every_seed_solves_it(path, capsys):
 def test_each_recipe_is_followed_by_its_peers():
     recipes = results.find_recipes()
     at = recipes.index("push_cube_cpu")
-    assert recipes[at : at + 3] == ["push_cube_cpu", "push_cube_maniskill_cpu", "push_cube_sb3"]
+    assert recipes[at : at + 3] == ["push_cube_cpu", "push_cube_maniskill", "push_cube_sb3"]
     assert len(recipes) == len(set(recipes)) and recipes[at + 3] == "pull_cube_cpu"
 
 
@@ -138,18 +135,40 @@ def test_steps_are_given_only_where_every_run_learned(path):
         assert "| 100 |" in path.read_text()
 
 
-def test_rows_are_of_todays_recipes(run_recipe):
+def test_peers_have_the_steps_and_the_evaluations_of_the_recipe():
+    """ManiSkill's own flags differ in all else, and Stable-Baselines3 has its defaults."""
+    names = ("env_id", "total_timesteps", "num_eval_episodes")
+    for name in results.COMPARED:
+        script, *flags = results.find_command(f"{name}_cpu")
+        own = ppo.parse_args(flags)
+        interval = own.eval_freq * own.batch_size
+
+        script, *flags = results.find_command(f"{name}_sb3")
+        given = dict(zip(flags[::2], flags[1::2]))
+        assert (results.ROOT / script).exists() and given.pop("--eval_interval") == str(interval)
+        assert given == {f"--{k}": str(getattr(own, k)) for k in names}
+
+        script, *flags = results.find_command(f"{name}_maniskill")
+        args = ppo.parse_args(flags)
+        assert all(getattr(args, k) == getattr(own, k) for k in names) and args.num_eval_steps is None
+        assert 0.6 < args.eval_freq * args.batch_size / interval < 1.7
+        assert (args.num_envs, args.cuda, args.norm_obs, args.num_minibatches) == (64, False, False, 32)
+
+
+def test_rows_are_of_todays_recipes():
     """The flags of each row in the table are those that its recipe and the defaults give today."""
     rows = results.read_rows(results.FOLDER / "results.jsonl")
     keys = [(row["recipe"], row["further_flags"], row["seed"]) for row in rows]
     assert len(set(keys)) == len(keys), "a row must not be there twice"
+    commands = {recipe: results.find_command(recipe) for recipe in {row["recipe"] for row in rows}}
     of_the_run = {"seed", "exp_name", "capture_video"}
     of_the_machine = {"num_envs", "num_eval_envs", "num_steps", "num_actors", "shader"}
     for row in rows:
-        if row["recipe"] in results.STABLE_BASELINES3:
-            assert row["task"] == results.STABLE_BASELINES3[row["recipe"]][0]
+        script, *flags = commands[row["recipe"]]
+        if row["recipe"].endswith("_sb3"):
+            assert row["flags"]["env_id"] == flags[1] and str(row["flags"]["total_timesteps"]) in flags
             continue
-        (script, *flags), _ = run_recipe(row["recipe"], *shlex.split(row["further_flags"]))
+        flags += shlex.split(row["further_flags"])
         today = asdict({"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script].parse_args(flags))
         for name in today.keys() - of_the_run - of_the_machine:
             assert row["flags"][name] == today[name], (row["recipe"], name)

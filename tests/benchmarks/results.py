@@ -31,31 +31,54 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+import ppo
+
 FOLDER = Path(__file__).resolve().parent
 EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256", "--no-cuda", "--no-capture_video")
-# Runs of sb3.py, to compare with: task, steps, steps from one evaluation to the next, and episodes of an evaluation, as
-# in the recipe.
-STABLE_BASELINES3 = {
-    "push_cube_sb3": ("PushCube-v1", 120_000, 16_000, 64),
-    "pick_cube_sb3": ("PickCube-v1", 600_000, 31_000, 64),
-    "poke_cube_sb3": ("PokeCube-v1", 1_200_000, 32_000, 64),
-    "cartpole_swing_up_sb3": ("MS-CartpoleSwingUp-v1", 400_000, 32_000, 8),
-    "ant_walk_sb3": ("MS-AntWalk-v1", 600_000, 32_000, 8),
-}
+# Recipes that are compared with peers: ManiSkill's own flags, and Stable-Baselines3.
+COMPARED = ("push_cube", "pick_cube", "cartpole_balance", "cartpole_swing_up", "ant_walk")
 TABLE_STARTS, TABLE_ENDS = "<!-- written by results.py -->", "<!-- end -->"
 
 
 def find_recipes() -> list[str]:
     """The recipes, each followed by the runs to compare it with."""
-    names = re.findall(r"^(\w+_cpu)\(\)", (ROOT / "examples/recipes.sh").read_text(), re.MULTILINE)
-    own = [name for name in names if not name.endswith("_maniskill_cpu")]
-    peers = {*names, *STABLE_BASELINES3}.difference(own)
-    return [name for recipe in own for name in (recipe, *sorted(x for x in peers if find_own_recipe(x) == recipe))]
+    recipes = []
+    for name in re.findall(r"^(\w+)_cpu\(\)", (ROOT / "examples/recipes.sh").read_text(), re.MULTILINE):
+        recipes.append(f"{name}_cpu")
+        if name in COMPARED:
+            recipes += [f"{name}_maniskill", f"{name}_sb3"]
+    return recipes
 
 
 def find_own_recipe(recipe: str) -> str:
     """The recipe that a run is compared with: itself, if it is no peer's."""
-    return re.sub("_(maniskill_cpu|sb3)$", "_cpu", recipe)
+    return re.sub("_(maniskill|sb3)$", "_cpu", recipe)
+
+
+def find_flags(recipe: str, *flags: str) -> list[str]:
+    """The script that a recipe runs, and its flags."""
+    stand_in = """python() { printf '%s\\0' "$@"; }; export -f python; bash "$@" """
+    command = ["bash", "-c", stand_in, "bash", str(ROOT / "examples/recipes.sh"), recipe, *flags]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split("\0")[:-1]
+
+
+def find_command(recipe: str) -> list[str]:
+    """The script and its flags, without seed and name. Peers have the task, the steps and the evaluations of the recipe
+    that they are compared with."""
+    own = find_flags(find_own_recipe(recipe))
+    if recipe == find_own_recipe(recipe):
+        return own
+    args = ppo.parse_args(own[1:])
+    interval = args.eval_freq * args.batch_size
+    shared = ["--total_timesteps", str(args.total_timesteps), "--num_eval_episodes", str(args.num_eval_episodes)]
+    if recipe.endswith("_sb3"):
+        return ["tests/benchmarks/sb3.py", "--env_id", args.env_id, "--eval_interval", str(interval), *shared]
+    shared += ["--num_eval_steps", "None"]
+    # 64 environments: with ManiSkill's 1,024 or more, there would be a few updates in all
+    published = find_flags(recipe.replace("_maniskill", "_gpu"), "--no-cuda", "--num_envs", "64", *shared)
+    eval_freq = round(interval / ppo.parse_args(published[1:]).batch_size)
+    return [*published, "--eval_freq", str(max(1, eval_freq))]
 
 
 def read_rows(path: Path) -> list[dict]:
@@ -89,23 +112,21 @@ def run_script(*command: str) -> str:
     return done.stdout
 
 
-def train(recipe: str, seed: int, flags: list[str], script: str, num_at_once: int) -> Path:
+def train(recipe: str, seed: int, flags: list[str], num_at_once: int) -> Path:
     """The folder of the finished run. Runs at once share the cores: with processes for all of them, they would wait for
     each other."""
     name = "_".join(["results", recipe, str(seed), *(flag.strip("-") for flag in flags)])
     run_dir = ROOT / "runs" / name
-    if recipe in STABLE_BASELINES3:
-        if not (run_dir / "best.json").exists():
-            names = ("--env_id", "--total_timesteps", "--eval_interval", "--num_eval_episodes")
-            own = [word for flag in zip(names, map(str, STABLE_BASELINES3[recipe])) for word in flag]
-            run_script("python", script, *own, "--seed", str(seed), "--exp_name", name, *flags)
-    elif (run_dir / "last.pt").exists():
-        run_script("python", script, "--resume", str(run_dir))
-    else:
-        own = ["--seed", str(seed), "--exp_name", name, "--no-capture_video"]
+    script, *own = find_command(recipe)
+    own += ["--seed", str(seed), "--exp_name", name]
+    if not recipe.endswith("_sb3"):
+        own.append("--no-capture_video")
         if num_at_once > 1:
             own += ["--num_actors", str(max(1, os.cpu_count() // num_at_once))]
-        run_script("bash", "examples/recipes.sh", recipe, *own, *flags)
+    if (run_dir / "last.pt").exists():
+        run_script("python", script, "--resume", str(run_dir))
+    elif not (run_dir / "best.json").exists():  # of sb3.py, which cannot resume
+        run_script("python", script, *own, *flags)
     return run_dir
 
 
@@ -150,15 +171,12 @@ def main_metric(metrics: dict) -> str:
 
 
 def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict:
-    if recipe in STABLE_BASELINES3:
-        script = str(FOLDER / "sb3.py")
-    else:
-        script = "ppo_rgb.py" if "images" in recipe else "ppo.py"
+    script = find_command(recipe)[0]
     commit = find_commit()  # the one that trains; there may be another when the row is written
-    run_dir = train(recipe, seed, flags, script, num_at_once)
+    run_dir = train(recipe, seed, flags, num_at_once)
     about = json.loads((run_dir / "args.json").read_text())
     best = evaluate(run_dir, script, "best.pt")
-    is_same = recipe not in STABLE_BASELINES3 and has_same_weights(run_dir)
+    is_same = (run_dir / "last.pt").exists() and has_same_weights(run_dir)
     last = best if is_same else evaluate(run_dir, script, "last.pt")
     curve = learning_curve(run_dir, main_metric(best))
     if "success_at_end" in best:
