@@ -1,6 +1,6 @@
 """Draw a film strip of each run: one unseen episode of its best.pt, from the first frame to the last.
 
-python tests/benchmarks/strips.py OUT.png runs/A runs/B ...
+python tests/benchmarks/strips.py tests/benchmarks/films runs/A runs/B ...      # writes films/<task of A>.png, …
 """
 
 import argparse
@@ -36,19 +36,18 @@ def film(run: Path, seed: int) -> tuple[str, list]:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out")
+    parser.add_argument("folder", type=Path)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--seed", type=int, default=100_000)
-    parser.add_argument("--frames", type=int, default=6)
+    parser.add_argument("--frames", type=int, default=8)
     options = parser.parse_args()
 
-    figure = Figure(figsize=(1.5 * options.frames, 1.65 * len(options.runs)), layout="constrained")
-    axes = figure.subplots(len(options.runs), options.frames, squeeze=False)
-    for row, run in zip(axes, options.runs):
+    options.folder.mkdir(exist_ok=True)
+    for run in options.runs:
         task, frames = film(run, options.seed)
-        draw_frames(row, frames)
-        row[0].set_title(task, fontsize=8)
-    figure.savefig(options.out, dpi=80)
+        figure = Figure(figsize=(1.5 * options.frames, 1.65), layout="constrained")
+        draw_frames(figure.subplots(1, options.frames), frames)
+        figure.savefig(options.folder / f"{task}.png", dpi=80)
 
 
 if __name__ == "__main__":
