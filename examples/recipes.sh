@@ -23,7 +23,7 @@ peg_insertion_side_cpu() { tabletop --env_id PegInsertionSide-v1 --total_timeste
 two_robot_pick_cube_cpu() { tabletop --env_id TwoRobotPickCube-v1 --total_timesteps 800000 "$@"; }
 place_apple_in_bowl_cpu() { tabletop --env_id UnitreeG1PlaceAppleInBowl-v1 --total_timesteps 200000 "$@"; }
 push_from_clutter_cpu() { tabletop --env_id examples.push_from_clutter:PushFromClutter-v1 --total_timesteps 250000 "$@"; }
-curriculum_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 400000 "$@"; }
+push_further_cpu() { tabletop --env_id examples.curriculum:PushFurther-v1 --total_timesteps 400000 "$@"; }
 
 # Tasks of several stages: with the defaults, the policy may stop exploring before it finds the next one. So it takes larger
 # steps, and its standard deviation learns more slowly.
