@@ -111,12 +111,12 @@ poke_cube_gpu() {
     maniskill ppo.py --env_id PokeCube-v1 --num_envs 1024 --total_timesteps 3000000 --eval_freq 10 --num_steps 20 "$@"
 }
 stack_cube_gpu() { maniskill ppo.py --env_id StackCube-v1 --num_envs 1024 --total_timesteps 25000000 "$@"; }
-cartpole_gpu() {
+maniskill_cartpole() {
     maniskill ppo.py --num_envs 1024 --num_steps 250 --num_eval_steps 1000 --gamma 0.99 --gae_lambda 0.95 \
         --eval_freq 5 "$@"
 }
-cartpole_balance_gpu() { cartpole_gpu --env_id MS-CartpoleBalance-v1 --total_timesteps 4000000 "$@"; }
-cartpole_swing_up_gpu() { cartpole_gpu --env_id MS-CartpoleSwingUp-v1 --total_timesteps 10000000 "$@"; }
+cartpole_balance_gpu() { maniskill_cartpole --env_id MS-CartpoleBalance-v1 --total_timesteps 4000000 "$@"; }
+cartpole_swing_up_gpu() { maniskill_cartpole --env_id MS-CartpoleSwingUp-v1 --total_timesteps 10000000 "$@"; }
 ant_walk_gpu() {
     maniskill ppo.py --env_id MS-AntWalk-v1 --num_envs 2048 --total_timesteps 20000000 --num_steps 200 \
         --num_eval_steps 1000 --gamma 0.97 --ent_coef 0.001 --eval_freq 10 "$@"

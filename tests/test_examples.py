@@ -245,6 +245,7 @@ def test_recipes_are_commands(in_tmp, monkeypatch):
         module = {"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script]
         args = module.parse_args(flags)
         module.check(args)
+        assert "--env_id" in flags, "a helper of recipes is no recipe"
         assert args.seed == 3 and ("cpu" in name) == ("--no-cuda" in flags)
         assert ("images" in name) == (script == "ppo_rgb.py")
 

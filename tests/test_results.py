@@ -61,7 +61,7 @@ def test_a_row_of_the_table(project, capsys):
     assert out.read_text().count("\n") == 1
     modified = (run_dir / "last.pt").stat().st_mtime
     with pytest.raises(SystemExit, match="0"):  # so is the run
-        results.train("push_cube_cpu", 2, shlex.split(FLAGS), 1)
+        results.train(["ppo.py"], "push_cube_cpu", 2, shlex.split(FLAGS), 1)
     assert (run_dir / "last.pt").stat().st_mtime == modified
 
     results.main([*command, "--table"])

@@ -9,7 +9,8 @@ best.pt and last.pt on 256 other episodes, and appends a row a run to results.js
     python tests/benchmarks/results.py --table              # writes the table in README.md here, and results.png
 
 Stop it at any time: it skips the rows that are there, and resumes a run that was interrupted. To repeat one row:
-`bash examples/recipes.sh <recipe> --seed <seed> <flags>`, then `--evaluate` with the flags of `EVALUATION`.
+`bash examples/recipes.sh <recipe> --seed <seed> <flags>`, then `--evaluate` with the flags of `EVALUATION`. To repeat
+the row of a peer: this script with `--recipes <peer> --seeds <seed>` and another `--out`.
 """
 
 import argparse
@@ -66,8 +67,9 @@ def find_flags(recipe: str, *flags: str) -> list[str]:
 def find_command(recipe: str) -> list[str]:
     """The script and its flags, without seed and name. Peers have the task, the steps and the evaluations of the recipe
     that they are compared with."""
-    own = find_flags(find_own_recipe(recipe))
-    if recipe == find_own_recipe(recipe):
+    own_recipe = find_own_recipe(recipe)
+    own = find_flags(own_recipe)
+    if recipe == own_recipe:
         return own
     args = ppo.parse_args(own[1:])
     interval = args.eval_freq * args.batch_size
@@ -112,12 +114,12 @@ def run_script(*command: str) -> str:
     return done.stdout
 
 
-def train(recipe: str, seed: int, flags: list[str], num_at_once: int) -> Path:
+def train(command: list[str], recipe: str, seed: int, flags: list[str], num_at_once: int) -> Path:
     """The folder of the finished run. Runs at once share the cores: with processes for all of them, they would wait for
     each other."""
     name = "_".join(["results", recipe, str(seed), *(flag.strip("-") for flag in flags)])
     run_dir = ROOT / "runs" / name
-    script, *own = find_command(recipe)
+    script, *own = command
     own += ["--seed", str(seed), "--exp_name", name]
     if not recipe.endswith("_sb3"):
         own.append("--no-capture_video")
@@ -171,9 +173,10 @@ def main_metric(metrics: dict) -> str:
 
 
 def make_row(recipe: str, seed: int, flags: list[str], num_at_once: int) -> dict:
-    script = find_command(recipe)[0]
+    command = find_command(recipe)
+    script = command[0]
     commit = find_commit()  # the one that trains; there may be another when the row is written
-    run_dir = train(recipe, seed, flags, num_at_once)
+    run_dir = train(command, recipe, seed, flags, num_at_once)
     about = json.loads((run_dir / "args.json").read_text())
     best = evaluate(run_dir, script, "best.pt")
     is_same = (run_dir / "last.pt").exists() and has_same_weights(run_dir)
