@@ -148,6 +148,7 @@ def main():
              f"--total_timesteps {options.total_timesteps} --num_eval_episodes {options.num_eval_episodes} "
              f"--seed {options.seed} --exp_name {options.exp_name}")  # fmt: skip
     args = ppo.parse_args(flags.split())
+    args.total_timesteps -= args.total_timesteps % args.batch_size  # SB3 would round up
     ppo.check(args)
     ppo.seed_all(args.seed)
     envs = VecNormalize(BatchedVecEnv(ppo.make_envs(args, NUM_ENVS, args.seed)))
@@ -160,7 +161,7 @@ def main():
     (run_dir / "args.json").write_text(json.dumps(about, indent=2) + "\n")
     with open(run_dir / "metrics.jsonl", "w") as file:
         callback = Evaluation(args, eval_envs, options.eval_interval, file)
-        model.learn(args.total_timesteps // args.batch_size * args.batch_size, callback=callback)
+        model.learn(args.total_timesteps, callback=callback)
     policy = Policy(model)
     for name, state in (("last", policy.state()), ("best", callback.best)):
         policy.load(state)
