@@ -76,7 +76,7 @@ def make_row(recipe, seed, success=None, reward=0.5, at_end=0.0):
     metrics["return"] = [1000 * reward, 0.0, 1000.0]
     if success is not None:
         metrics |= dict(success_once=[success, 0.0, 1.0], success_at_end=[at_end, 0.0, 1.0])
-    curve = [[100 * i, 60.0 * i, reward * i] for i in range(3)]
+    curve = [[100 * i, 60.0 * i, reward * i * (1000 if success is None else 1)] for i in range(3)]
     return dict(
         recipe=recipe, further_flags="", seed=seed, task=recipe, steps=200, training_seconds=0.2, runs_at_once=seed,
         physics_alone=2000, best=metrics, last=metrics, steps_to_nine_tenths_of_the_best=100, curve=curve,
@@ -126,7 +126,7 @@ def test_steps_are_given_only_where_every_run_learned(path):
     """Else the table would give the step of an evaluation that was better by chance."""
     rates = [make_row("push_cube_cpu", seed, 0.5) for seed in (1, 2)]
     returns = [make_row("cartpole_balance_cpu", seed) for seed in (1, 2)]
-    for rows, first, too_little, enough in ((rates, 0.0, 0.19, 0.2), (returns, 300, 600, 601)):
+    for rows, first, too_little, enough in ((rates, 0.0, 0.19, 0.2), (returns, 300, 499, 500)):
         rows[1]["curve"] = [[0, 0.0, first], [100, 60.0, too_little]]
         results.write_table(rows, path)
         assert "| 100 |" not in path.read_text()

@@ -231,11 +231,10 @@ def is_solved(row: dict, metric: str) -> bool:
 
 
 def has_learned(row: dict) -> bool:
-    """The success rate rose by 0.2 (less may be chance) or, without success, the return more than doubled."""
+    """The success rate rose by 0.2 (less may be chance) or, without success, the return by 0.2 of its maximum."""
     values = [point[2] for point in row["curve"]]
-    if "success_once" in row["best"]:
-        return max(values) - values[0] >= 0.2
-    return max(values) > 2 * values[0]
+    maximum = 1 if "success_once" in row["best"] else row["best"]["episode_len"][0]
+    return max(values) - values[0] >= 0.2 * maximum
 
 
 def join_seeds(runs: list[dict], policy: str, metric: str) -> str:
