@@ -4,7 +4,7 @@
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
 # Results of the _cpu recipes are in tests/benchmarks/README.md. The flags of the _gpu recipes are ManiSkill's own. Nobody
-# has run them here as they stand, but some with 64 environments on a CPU: the rows `_maniskill` of the same page.
+# has run them here as they stand. Some were run with 64 environments on a CPU: the rows `_maniskill` of the same page.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
