@@ -37,7 +37,7 @@ place_sphere_cpu() { stages --env_id PlaceSphere-v1 --num_eval_episodes 128 --to
 # With 128 environments, the robot may learn to hold the peg above the cube: the reward pays for that as well. Without
 # the bonus for entropy, the policy may stop exploring before it has grasped the peg.
 poke_cube_cpu() {
-    stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --ent_coef 0.003 --total_timesteps 2000000 "$@"
+    stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --ent_coef 0.003 --total_timesteps 3000000 "$@"
 }
 
 # With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
