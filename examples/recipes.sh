@@ -34,9 +34,9 @@ lift_peg_upright_cpu() { stages --env_id LiftPegUpright-v1 --total_timesteps 100
 # Its success rate goes up and down near 0.9: of 64 evaluation episodes, best.pt would be chosen by luck.
 place_sphere_cpu() { stages --env_id PlaceSphere-v1 --num_eval_episodes 128 --total_timesteps 1600000 "$@"; }
 
-# With 128 environments, the robot may learn to hold the peg above the cube: the reward pays for that as well. A larger
-# gamma makes it worth leaving that place. Without the bonus for entropy, the policy may stop exploring before it has
-# grasped the peg.
+# The reward also pays for a peg above the cube or beside it. With 128 environments, the robot may learn to hold it there.
+# With a larger gamma, it is worth more to leave such a place. Without the bonus for entropy, the policy may stop exploring
+# before it has grasped the peg.
 poke_cube_cpu() {
     stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --gamma 0.95 --ent_coef 0.003 --total_timesteps 2000000 "$@"
 }
