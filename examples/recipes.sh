@@ -38,7 +38,7 @@ place_sphere_cpu() { stages --env_id PlaceSphere-v1 --num_eval_episodes 128 --to
 # With a larger gamma, it is worth more to leave such a place. Without the bonus for entropy, the policy may stop exploring
 # before it has grasped the peg.
 poke_cube_cpu() {
-    stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --gamma 0.95 --ent_coef 0.003 --total_timesteps 2000000 "$@"
+    stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --gamma 0.95 --ent_coef 0.003 --total_timesteps 3000000 "$@"
 }
 
 # With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
