@@ -1,6 +1,6 @@
 """Draw the README's picture from finished runs: learning curves over steps and minutes, and frames of a video.
 
-python tests/benchmarks/picture.py OUT.png runs/A runs/B ... --video runs/A/test_videos/seed_1000_0.mp4
+python tests/benchmarks/picture.py OUT.png runs/A runs/B ... --video runs/A/test_videos/seed_1000.mp4
 """
 
 import argparse
