@@ -15,7 +15,6 @@ tabletop() { python ppo.py --no-cuda --eval_freq 20 "$@"; }
 push_cube_cpu() { tabletop --env_id PushCube-v1 --eval_freq 10 --total_timesteps 120000 "$@"; }
 pull_cube_cpu() { tabletop --env_id PullCube-v1 --total_timesteps 200000 "$@"; }
 pick_cube_so100_cpu() { tabletop --env_id PickCubeSO100-v1 --total_timesteps 800000 "$@"; }
-stack_cube_cpu() { tabletop --env_id StackCube-v1 --total_timesteps 800000 "$@"; }
 # The ball rolls on alone, so its reward comes late: ManiSkill's own gamma for this task.
 roll_ball_cpu() { tabletop --env_id RollBall-v1 --gamma 0.95 --total_timesteps 800000 "$@"; }
 pull_cube_tool_cpu() { tabletop --env_id PullCubeTool-v1 --total_timesteps 800000 "$@"; }
@@ -33,6 +32,11 @@ pick_cube_cpu() { stages --env_id PickCube-v1 --total_timesteps 600000 "$@"; }
 lift_peg_upright_cpu() { stages --env_id LiftPegUpright-v1 --total_timesteps 1000000 "$@"; }
 # Its success rate goes up and down near 0.9: of 64 evaluation episodes, best.pt would be chosen by luck.
 place_sphere_cpu() { stages --env_id PlaceSphere-v1 --num_eval_episodes 128 --total_timesteps 1600000 "$@"; }
+
+# Without the bonus for entropy, the policy may hold the cube on the other one, and never open its hand.
+stack_cube_cpu() {
+    stages --env_id StackCube-v1 --ent_coef 0.003 --num_eval_episodes 128 --eval_freq 40 --total_timesteps 3600000 "$@"
+}
 
 # The reward also pays for a peg above the cube or beside it. With 128 environments, the robot may learn to hold it there.
 # With a larger gamma, it is worth more to leave such a place. Without the bonus for entropy, the policy may stop exploring
