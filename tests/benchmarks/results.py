@@ -244,11 +244,6 @@ def join_seeds(runs: list[dict], policy: str, metric: str) -> str:
     return ", ".join(f"{mean:,.{digits}f}" for mean in means)
 
 
-def describe_minutes(run: dict) -> str:
-    """A run that shared the cores with another one would have been faster alone."""
-    return f"{'≤ ' if run['runs_at_once'] > 1 else ''}{run['training_seconds'] / 60:.1f}"
-
-
 def write_table(rows: list[dict], path: Path) -> None:
     """Replace the table in this file. What every seed solves is bold."""
     names = ("recipe", "task", "steps", "seeds", "success once", "success at end", "return", "last policy", "90% after")
@@ -308,8 +303,9 @@ def draw_curves(rows: list[dict], path: Path) -> None:
     for axis in axes[len(groups) :]:
         axis.axis("off")
     for axis, (recipe, runs) in zip(axes, groups.items()):
-        for peer, style in zip(peers[recipe], ("-", "--")):
-            draw_mean(axis, peer, 2, color="grey", linestyle=style)
+        for peer in peers[recipe]:
+            is_sb3 = peer[0]["recipe"].endswith("_sb3")
+            draw_mean(axis, peer, 2, color="grey", linestyle="--" if is_sb3 else "-")
         draw_mean(axis, runs, 2, color="C0")
         if all(len(point) > 3 for run in runs for point in run["curve"]):
             draw_mean(axis, runs, 3, color="C1")
