@@ -33,7 +33,8 @@ lift_peg_upright_cpu() { stages --env_id LiftPegUpright-v1 --total_timesteps 100
 # Its success rate goes up and down near 0.9: of 64 evaluation episodes, best.pt would be chosen by luck.
 place_sphere_cpu() { stages --env_id PlaceSphere-v1 --num_eval_episodes 128 --total_timesteps 1600000 "$@"; }
 
-# Without the bonus for entropy, the policy may hold the cube on the other one, and never open its hand.
+# Without the bonus for entropy, the policy may hold the cube on the other one, and never open its hand. Here, too,
+# 64 episodes would choose best.pt by luck. 128 take longer, so there are half as many evaluations.
 stack_cube_cpu() {
     stages --env_id StackCube-v1 --ent_coef 0.003 --num_eval_episodes 128 --eval_freq 40 --total_timesteps 3600000 "$@"
 }
