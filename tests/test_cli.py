@@ -311,9 +311,9 @@ def frames(path):
 
 @pytest.mark.render
 def test_videos_and_trajectories(in_tmp, capfd):
-    short = ("--env_kwargs", '{"max_episode_steps": 8}')
-    flags = (*TINY, *short, "--save_trajectory", "--save_train_video_freq", 1, "--num_envs", 2, "--num_actors", 2,
-             "--num_steps", 10, "--num_eval_envs", 4, "--num_eval_episodes", 4)  # fmt: skip
+    short = '{"max_episode_steps": 8, "human_render_camera_configs": {"width": 128, "height": 128}}'
+    flags = (*TINY, "--env_kwargs", short, "--save_trajectory", "--save_train_video_freq", 1, "--num_envs", 2,
+             "--num_actors", 2, "--num_steps", 10, "--num_eval_envs", 4, "--num_eval_episodes", 4)  # fmt: skip
     assert ppo.main([*map(str, flags)]) == 0 and capfd.readouterr().err == ""
     run = in_tmp / "runs/tiny"
     videos = sorted(path.name for path in (run / "videos").glob("*.mp4"))

@@ -26,6 +26,7 @@ import pytest
 import torch
 from conftest import (
     ACTIONS,
+    CPU_AND_CUDA,
     NO_VULKAN,
     ROOT,
     SMALL,
@@ -44,6 +45,9 @@ from torch.utils._pytree import tree_leaves
 import ppo
 import ppo_rgb
 
+# for what a pretended GPU does as the CPU does: files, signals and counters
+not_pretended = pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+
 
 def signal_self():
     os.kill(os.getpid(), signal.SIGTERM)
@@ -57,21 +61,24 @@ RUN = dict(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("iteration, action", [(0, crash), (2, signal_self), (5, crash), (6, signal_self), (11, crash)])
-def test_exact_resume_is_bit_identical(train, in_update, in_tmp, signals, iteration, action):
+def test_exact_resume_is_bit_identical(train, in_update, in_tmp, signals):
     """A run that stops anywhere, even in the middle of an update, and is resumed ends with the same bits as one that
     never stopped."""
     metrics, _ = train(**RUN, exact_resume=True)
-    in_update(iteration, action)
-    with pytest.raises(Stop if action is crash else KeyboardInterrupt):
-        train(**RUN, exact_resume=True)
-    stopped = ppo.load_checkpoint("runs/run2/last.pt")
-    assert stopped["iteration"] == iteration // 3 * 3, "last.pt must be from the last boundary"
-    train(**RUN, exact_resume=True, resume="runs/run2")
-    assert same_run(in_tmp / "runs/run1", in_tmp / "runs/run2")
-    assert len(metrics) == 12 + 4 and len(scalars("runs/run2")["train/value_loss"]) == 12
+    assert len(metrics) == 12 + 4
+    for iteration, action in ((0, crash), (2, signal_self), (5, crash), (6, signal_self), (11, crash)):
+        name = f"stopped{iteration}"
+        in_update(iteration, action)
+        with pytest.raises(Stop if action is crash else KeyboardInterrupt):
+            train(**RUN, exact_resume=True, exp_name=name)
+        stopped = ppo.load_checkpoint(f"runs/{name}/last.pt")
+        assert stopped["iteration"] == iteration // 3 * 3, "last.pt must be from the last boundary"
+        train(**RUN, exact_resume=True, resume=f"runs/{name}")
+        assert same_run(in_tmp / "runs/run1", in_tmp / f"runs/{name}")
+        assert len(scalars(f"runs/{name}")["train/value_loss"]) == 12
 
 
+@not_pretended
 def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
     """Resuming from any checkpoint of a finished run reaches the same end. The flag does change the run: episodes
     restart at each checkpoint."""
@@ -84,6 +91,7 @@ def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
     assert not same_weights(other, ppo.load_checkpoint("runs/run1/last.pt")), "the flag must change the run"
 
 
+@not_pretended
 @pytest.mark.parametrize("action", [crash, signal_self])
 def test_resume_twice_is_the_same_twice(train, in_update, in_tmp, signals, action):
     """Without --exact_resume, a resumed run keeps all finished iterations and repeats no row. Resuming twice gives the
@@ -116,12 +124,14 @@ def test_resume_continues_normalisation_optimizer_and_schedule(train, in_update,
     assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {12 * 8}
 
 
+@not_pretended
 def test_a_finished_run_can_go_on(train, in_tmp):
     train(total_timesteps=320 * 2)
     metrics, last = train(total_timesteps=320 * 5, resume="runs/run1")
     assert last["iteration"] == 5 and [r["global_step"] // 320 for r in metrics if r["kind"] == "eval"] == [0, 2, 4, 5]
 
 
+@not_pretended
 def test_signal_in_the_last_evaluation(train, in_tmp, monkeypatch, signals):
     """Resuming the run repeats that evaluation. Only then is the run finished."""
     evaluate, first_looks, flags = ppo.evaluate, [], dict(RUN, eval_freq=0)
@@ -143,6 +153,7 @@ def test_signal_in_the_last_evaluation(train, in_tmp, monkeypatch, signals):
     assert metrics[-1]["kind"] == "eval" and metrics[-1]["global_step"] == 12 * 320
 
 
+@not_pretended
 def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     """This holds even if the run resumes from a checkpoint that is older than best.pt."""
     train(**RUN)
@@ -153,6 +164,7 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     assert Path("runs/run1/best.pt").read_bytes() == before
 
 
+@not_pretended
 def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
     """Fewer steps are refused. With as many, the script prints that the run is finished. Neither changes the run."""
     metrics, _ = train(total_timesteps=320 * 4)
@@ -202,14 +214,15 @@ def poison(monkeypatch, quantity, at, value=float("nan"), env_idx=(3, 7)):
 def test_non_finite_steps_end_the_run(train, in_tmp, monkeypatch, quantity, value):
     """The third iteration ends the run before its update. The line names the environments, and the resumed run goes on
     from the second update with new episodes."""
+    flags = RUN | dict(total_timesteps=320 * 4, save_freq=1)
     with monkeypatch.context() as patch:
         poison(patch, quantity, at=[25], value=value)
         with pytest.raises(ppo.RunError, match=r"NaN or infinity in environments \[3, 7\]"):
-            train(**RUN | dict(save_freq=1))
+            train(**flags)
     last, before = [ppo.load_checkpoint(f"runs/run1/{name}.pt") for name in ("last", "iteration_2")]
     assert last["iteration"] == 2 and same_weights(last, before)
-    metrics, last = train(**RUN, resume="runs/run1")
-    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
+    metrics, last = train(**flags, resume="runs/run1")
+    assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [1, 2, 3, 4]
     assert all(torch.isfinite(x).all() for x in last["agent"].values())
 
 
@@ -258,6 +271,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 12
 
 
+@not_pretended
 def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
     """If metrics.jsonl cannot grow, the run ends. When it is resumed, no row is missing or broken."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -561,6 +575,7 @@ def test_memory_that_is_too_small_is_refused(monkeypatch, capsys, encoder, num_e
     assert re.search(r"training needs [\d,]+ MiB, and [\d,]+ MiB of memory are free: try --num_steps 5, fewer", line)
 
 
+@not_pretended
 def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, capsys):
     """The script refuses the run before it writes anything, and names remedies; otherwise the run would end in a
     "Bus error". One actor needs no shared memory."""
@@ -574,6 +589,7 @@ def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, 
     train()
 
 
+@not_pretended
 def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
     """A run cannot be resumed while it is still running: two processes would write every row twice."""
     lines = []
