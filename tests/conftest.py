@@ -79,7 +79,9 @@ def pytest_runtest_setup(item):
 
 
 CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
-CPU_AND_CUDA, GPUS = ["cpu", CUDA], ["pretended", CUDA]
+# for what the pretended GPU cannot show, or does as the CPU does
+on_cpu_and_cuda = pytest.mark.parametrize("device", ["cpu", CUDA], indirect=True)
+on_gpus = pytest.mark.parametrize("device", ["pretended", CUDA], indirect=True)
 
 
 @pytest.fixture(params=["cpu", pytest.param("pretended", marks=pytest.mark.slow), CUDA])

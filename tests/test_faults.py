@@ -26,13 +26,13 @@ import pytest
 import torch
 from conftest import (
     ACTIONS,
-    CPU_AND_CUDA,
     NO_VULKAN,
     ROOT,
     SMALL,
     Stop,
     box,
     crash,
+    on_cpu_and_cuda,
     read_metrics,
     refused,
     run_script,
@@ -44,9 +44,6 @@ from torch.utils._pytree import tree_leaves
 
 import ppo
 import ppo_rgb
-
-# for what a pretended GPU does as the CPU does: files, signals and counters
-not_pretended = pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
 
 
 def signal_self():
@@ -78,7 +75,7 @@ def test_exact_resume_is_bit_identical(train, in_update, in_tmp, signals):
         assert len(scalars(f"runs/{name}")["train/value_loss"]) == 12
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
     """Resuming from any checkpoint of a finished run reaches the same end. The flag does change the run: episodes
     restart at each checkpoint."""
@@ -91,7 +88,7 @@ def test_exact_resume_repeats_its_own_boundaries(train, in_tmp):
     assert not same_weights(other, ppo.load_checkpoint("runs/run1/last.pt")), "the flag must change the run"
 
 
-@not_pretended
+@on_cpu_and_cuda
 @pytest.mark.parametrize("action", [crash, signal_self])
 def test_resume_twice_is_the_same_twice(train, in_update, in_tmp, signals, action):
     """Without --exact_resume, a resumed run keeps all finished iterations and repeats no row. Resuming twice gives the
@@ -124,14 +121,14 @@ def test_resume_continues_normalisation_optimizer_and_schedule(train, in_update,
     assert {float(s["step"]) for s in last["optimizer"]["state"].values()} == {12 * 8}
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_a_finished_run_can_go_on(train, in_tmp):
     train(total_timesteps=320 * 2)
     metrics, last = train(total_timesteps=320 * 5, resume="runs/run1")
     assert last["iteration"] == 5 and [r["global_step"] // 320 for r in metrics if r["kind"] == "eval"] == [0, 2, 4, 5]
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_signal_in_the_last_evaluation(train, in_tmp, monkeypatch, signals):
     """Resuming the run repeats that evaluation. Only then is the run finished."""
     evaluate, first_looks, flags = ppo.evaluate, [], dict(RUN, eval_freq=0)
@@ -153,7 +150,7 @@ def test_signal_in_the_last_evaluation(train, in_tmp, monkeypatch, signals):
     assert metrics[-1]["kind"] == "eval" and metrics[-1]["global_step"] == 12 * 320
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     """This holds even if the run resumes from a checkpoint that is older than best.pt."""
     train(**RUN)
@@ -164,7 +161,7 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     assert Path("runs/run1/best.pt").read_bytes() == before
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
     """Fewer steps are refused. With as many, the script prints that the run is finished. Neither changes the run."""
     metrics, _ = train(total_timesteps=320 * 4)
@@ -271,7 +268,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 12
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
     """If metrics.jsonl cannot grow, the run ends. When it is resumed, no row is missing or broken."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -575,7 +572,7 @@ def test_memory_that_is_too_small_is_refused(monkeypatch, capsys, encoder, num_e
     assert re.search(r"training needs [\d,]+ MiB, and [\d,]+ MiB of memory are free: try --num_steps 5, fewer", line)
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, capsys):
     """The script refuses the run before it writes anything, and names remedies; otherwise the run would end in a
     "Bus error". One actor needs no shared memory."""
@@ -589,7 +586,7 @@ def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, 
     train()
 
 
-@not_pretended
+@on_cpu_and_cuda
 def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
     """A run cannot be resumed while it is still running: two processes would write every row twice."""
     lines = []

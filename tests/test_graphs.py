@@ -13,7 +13,7 @@ import pytest
 import test_rgb
 import torch
 import torch.nn as nn
-from conftest import CPU_AND_CUDA, GPUS, ROOT, SMALL, without_clock
+from conftest import ROOT, SMALL, on_cpu_and_cuda, on_gpus, without_clock
 from pretended_gpu import GpuTensor, PretendedGpu
 from torch.distributions import Normal
 from torch.nn.functional import one_hot
@@ -30,9 +30,6 @@ def script(request):
 @pytest.fixture
 def small(script):
     return SMALL if script is ppo else test_rgb.SMALL_IMAGES
-
-
-on_gpus = pytest.mark.parametrize("device", GPUS, indirect=True)
 
 
 def close(a, b):
@@ -78,7 +75,7 @@ def test_equals_step_by_step_after_a_resume(train, small):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+@on_cpu_and_cuda
 @pytest.mark.parametrize("script", [ppo])
 def test_compiled_is_near(train, script, device, monkeypatch):
     """The compiled network is near the original in every minibatch. It draws the noise of actions from another

@@ -44,6 +44,12 @@ def train_task(device, in_tmp, monkeypatch):
     return run
 
 
+def test_shapes_and_tuples_keep_their_type(device):
+    x = torch.ones(2, 3, device=device)
+    assert type(x.shape) is type(x.size()) is torch.Size
+    assert x.is_cuda and all(part.is_cuda for part in x.max(dim=1)) and x.max(dim=1).values.is_cuda
+
+
 @pytest.mark.parametrize(
     "env_id", ["PushCube-v1", *(pytest.param(x, marks=pytest.mark.slow) for x in TASKS if x != "PushCube-v1")]
 )

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import CPU_AND_CUDA, NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_script, same_run
+from conftest import NO_VULKAN, ROOT, Stop, crash, on_cpu_and_cuda, read_metrics, refused, run_script, same_run
 
 import ppo_rgb
 
@@ -266,7 +266,7 @@ def test_memory_format_changes_speed_alone(device):
     torch.testing.assert_close(*values, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+@on_cpu_and_cuda
 def test_mixed_precision_is_near(device):
     envs = batched_env.make_envs(SMALL_IMAGES, 16, 0, device=device)
     obs, _ = envs.reset(seed=list(range(16)))
@@ -311,7 +311,7 @@ def test_all_options_train(train):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+@on_cpu_and_cuda
 def test_learns_from_images(train, device):
     """The policy learns to reach a goal that only the images show.
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from batched_env import BatchedReach
-from conftest import ACTIONS, CPU_AND_CUDA, SMALL, box, read_metrics, same_weights
+from conftest import ACTIONS, SMALL, box, on_cpu_and_cuda, read_metrics, same_weights
 from test_rollout import gae_of_episodes
 
 import ppo
@@ -369,7 +369,7 @@ FINITE_HORIZON = dict(finite_horizon_gae=True, clip_vloss=True, target_kl=None)
     [({}, 1), (TEXTBOOK, 2), (FINITE_HORIZON, 3)],
     ids=["default", "textbook", "finite-horizon"],
 )
-@pytest.mark.parametrize("device", CPU_AND_CUDA, indirect=True)
+@on_cpu_and_cuda
 def test_learns(train, device, flags, seed):
     size = dict(num_envs=128, total_timesteps=40_000, eval_freq=0)
     metrics, _ = train(seed=seed, learning_rate=1e-3, update_epochs=8, cudagraphs=True, **size, **flags)
