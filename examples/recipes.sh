@@ -48,7 +48,7 @@ poke_cube_cpu() {
 
 # With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
 push_to_goal_cpu() {
-    tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 400000 "$@"
+    tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 800000 "$@"
 }
 
 # The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. The cube has
