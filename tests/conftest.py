@@ -69,6 +69,11 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write_line(f"on {simulation}: {counts}")
 
 
+# SAPIEN's renderer lives as long as a scene that renders, and takes ten seconds to start with software Vulkan. With one
+# that stays, it starts once in a process, not in each test.
+RENDERERS = []
+
+
 def pytest_runtest_setup(item):
     if item.get_closest_marker("gpu") and not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
@@ -76,6 +81,8 @@ def pytest_runtest_setup(item):
         if ppo.RENDER_DEVICE is None:
             # CI installs software Vulkan: if the renderer is missing there, the test fails
             (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a Vulkan device")
+        if not RENDERERS:
+            RENDERERS.append(ppo.sapien.render.RenderSystem())
 
 
 CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
