@@ -5,12 +5,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import contextlib
 import fcntl
+import functools
 import json
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import batched_env
@@ -69,9 +69,11 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write_line(f"on {simulation}: {counts}")
 
 
-# SAPIEN's renderer lives as long as a scene that renders, and takes ten seconds to start with software Vulkan. With one
-# that stays, it starts once in a process, not in each test.
-RENDERERS = []
+@functools.cache
+def keep_renderer():
+    """SAPIEN's renderer ends with the last scene that renders, and takes ten seconds to start with software Vulkan.
+    With one that stays, it starts once in a process, not in each test."""
+    return ppo.sapien.render.RenderSystem(ppo.RENDER_DEVICE)
 
 
 def pytest_runtest_setup(item):
@@ -81,8 +83,7 @@ def pytest_runtest_setup(item):
         if ppo.RENDER_DEVICE is None:
             # CI installs software Vulkan: if the renderer is missing there, the test fails
             (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a Vulkan device")
-        if not RENDERERS:
-            RENDERERS.append(ppo.sapien.render.RenderSystem())
+        keep_renderer()
 
 
 CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
@@ -143,7 +144,7 @@ def train(in_tmp, monkeypatch, device, script, small):
     """A function that trains in this process on the torch-native environments, with the given flags. Its runs are named
     run1, run2, … It returns the metrics and the last checkpoint. There are no CUDA graphs unless the test asks for
     them, because a graph does not call what a test puts in place of a function."""
-    monkeypatch.setattr(script, "make_envs", partial(batched_env.make_envs, device=device))
+    monkeypatch.setattr(script, "make_envs", functools.partial(batched_env.make_envs, device=device))
     monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # plotting takes longer than these runs
     count = 0
 
