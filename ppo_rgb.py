@@ -1832,9 +1832,9 @@ class Logger:
             self.lock.acquire(timeout=0)
         except filelock.Timeout:
             fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
-        path, size = run_dir / "metrics.jsonl", resumed.get("metrics_size", 0)  # later steps are done again
+        path = run_dir / "metrics.jsonl"
         path.touch()
-        path.write_bytes(path.read_bytes()[:size])
+        os.truncate(path, min(path.stat().st_size, resumed.get("metrics_size", 0)))  # later steps are done again
         self.file = open(path, "a")
         hardware = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{num_cores()} CPU core(s)"
         packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")

@@ -270,19 +270,24 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
 
 @on_cpu_and_cuda
 def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
-    """If metrics.jsonl cannot grow, the run ends. When it is resumed, no row is missing or broken."""
+    """If metrics.jsonl cannot grow, the run ends. When it is resumed, even on a disk that is still full, no row is missing
+    or broken."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def fill():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + 100, unlimited[1]))
+    def limit(size):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, unlimited[1]))
 
-    in_update(3, fill)
+    in_update(3, lambda: limit(file.stat().st_size + 100))
     try:
         with pytest.raises(OSError):
             train(**RUN)
+        gc.collect()  # the lock of the run's folder, which a user's process would release when it ends
+        limit(100)
+        with pytest.raises(OSError):
+            train(**RUN, resume="runs/run1")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
-    gc.collect()  # the lock of the run's folder, which a user's process would release when it ends
+    gc.collect()
     assert ppo.load_checkpoint("runs/run1/last.pt")["iteration"] == 3
     metrics, last = train(**RUN, resume="runs/run1")
     assert last["iteration"] == 12
