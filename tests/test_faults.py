@@ -58,6 +58,7 @@ RUN = dict(
 )  # fmt: skip
 
 
+@on_cpu_and_cuda
 def test_exact_resume_is_bit_identical(train, in_update, in_tmp, signals):
     """A run that stops anywhere, even in the middle of an update, and is resumed ends with the same bits as one that
     never stopped."""
@@ -270,8 +271,8 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
 
 @on_cpu_and_cuda
 def test_a_full_disk_cuts_no_row_off(train, in_update, in_tmp):
-    """If metrics.jsonl cannot grow, the run ends. When it is resumed, even on a disk that is still full, no row is missing
-    or broken."""
+    """If metrics.jsonl cannot grow, the run ends. When it is resumed, even on a disk that is still full, no row is
+    missing or broken."""
     file, unlimited = Path("runs/run1/metrics.jsonl"), resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def limit(size):

@@ -53,7 +53,8 @@ FLAGS = [
 
 @on_gpus
 @pytest.mark.parametrize("flags", FLAGS, ids=["kl-stop", "others", "every-float"])
-def test_equals_step_by_step(train, script, flags):
+def test_equals_step_by_step(train, script, small, flags):
+    flags = flags | dict(eval_freq=0, total_timesteps=3 * small.num_envs * small.num_steps)
     if script is ppo_rgb:
         flags = flags | dict(random_shift=2, obs_mode="rgb+depth+segmentation", update_epochs=2)
     (rows, last), (graph_rows, graph_last) = train(cudagraphs=False, **flags), train(cudagraphs=True, **flags)
@@ -67,8 +68,8 @@ def test_equals_step_by_step_after_a_resume(train, small):
     size, results = small.num_envs * small.num_steps, []
     for i, cudagraphs in enumerate((False, True)):
         flags = dict(eval_freq=0, anneal_lr=True, cudagraphs=cudagraphs)
-        train(total_timesteps=4 * size, **flags)
-        results.append(train(resume=f"runs/run{i + 1}", total_timesteps=8 * size, **flags))
+        train(total_timesteps=size, **flags)
+        results.append(train(resume=f"runs/run{i + 1}", total_timesteps=3 * size, **flags))
     (rows, last), (graph_rows, graph_last) = results
     assert all(close(a, b) for a, b in zip(without_clock(rows), without_clock(graph_rows), strict=True))
     assert close(last["agent"], graph_last["agent"])
@@ -220,18 +221,15 @@ def test_the_host_waits_for_nothing_in_rollout_and_update(train, script, device,
     mode("default")
 
 
-def count_waits(train, num_iterations, size, **flags):
-    """What made the host wait in a run without evaluations in between."""
-    PretendedGpu.waits.clear()
-    train(total_timesteps=num_iterations * size, eval_freq=0, **flags)
-    return Counter(PretendedGpu.waits)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("device", ["pretended"], indirect=True)
 def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
     """An iteration waits as often, whatever its number of steps and minibatches. target_kl waits once an epoch."""
-    step = script.ManiSkillVectorEnv.step
+    rollout, step, starts = script.rollout, script.ManiSkillVectorEnv.step, []
+
+    def counted_rollout(*arguments):
+        starts.append(len(PretendedGpu.waits))
+        return rollout(*arguments)
 
     def step_without_counting(envs, actions):  # ManiSkill's own waits
         waits = len(PretendedGpu.waits)
@@ -239,12 +237,13 @@ def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
         del PretendedGpu.waits[waits:]
         return result
 
+    monkeypatch.setattr(script, "rollout", counted_rollout)
     monkeypatch.setattr(script.ManiSkillVectorEnv, "step", step_without_counting)
     an_iteration = []
     for num_steps, num_minibatches, target_kl in ((4, 2, None), (8, 4, None), (4, 2, 1e9)):
         flags = dict(num_steps=num_steps, num_minibatches=num_minibatches, target_kl=target_kl, update_epochs=3)
-        counts = [count_waits(train, n, small.num_envs * num_steps, **flags) for n in (6, 7)]
-        an_iteration.append(counts[1] - counts[0])
+        train(total_timesteps=3 * small.num_envs * num_steps, eval_freq=0, **flags)
+        an_iteration.append(Counter(PretendedGpu.waits[starts[-2] : starts[-1]]))
     assert an_iteration[0] == an_iteration[1]
     assert (an_iteration[2] - an_iteration[0]) == Counter(__bool__=3)
     assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1, synchronize=1)

@@ -371,13 +371,14 @@ FINITE_HORIZON = dict(finite_horizon_gae=True, clip_vloss=True, target_kl=None)
 )
 @on_cpu_and_cuda
 def test_learns(train, device, flags, seed):
-    size = dict(num_envs=128, total_timesteps=40_000, eval_freq=0)
+    size = dict(num_envs=128, total_timesteps=20_480, eval_freq=0)
     metrics, _ = train(seed=seed, learning_rate=1e-3, update_epochs=8, cudagraphs=True, **size, **flags)
     first, last = [row for row in metrics if row["kind"] == "eval"]
     assert first["success_once"] < 0.2
     assert last["success_once"] >= 0.95 and last["num_episodes"] == 24
 
 
+@on_cpu_and_cuda
 def test_evaluation_schedule_and_no_effect_on_training(train):
     """Evaluations run before training, every eval_freq iterations, and after the last one. The weights do not depend on
     them."""
@@ -389,6 +390,7 @@ def test_evaluation_schedule_and_no_effect_on_training(train):
     assert checkpoints[0]["iteration"] == 4 and checkpoints[0]["global_step"] == 1280
 
 
+@on_cpu_and_cuda
 def test_same_seed_same_weights_other_seed_others(train):
     (_, a), (_, b), (_, c) = train(seed=5), train(seed=5), train(seed=6)
     assert same_weights(a, b) and not same_weights(a, c)
