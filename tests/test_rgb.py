@@ -430,15 +430,14 @@ def test_train_resume_evaluate_and_film(tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.render
-def test_two_actors_train_from_images(tmp_path):
+def test_two_actors_train_from_images(in_tmp, capfd):
     """The command trains with two processes: each simulates three environments and writes images for the learner."""
     flags = ("--env_id", "MS-CartpoleBalance-v1", "--camera_width", 40, "--camera_height", 40, "--frame_stack", 2,
              "--num_envs", 6, "--num_actors", 2, "--num_eval_envs", 4, "--num_eval_episodes", 4, "--num_steps", 10,
              "--total_timesteps", 180, "--num_minibatches", 2, "--eval_freq", 2, "--no-capture_video", "--no-cuda",
              "--env_kwargs", '{"max_episode_steps": 8}', "--exp_name", "two")  # fmt: skip
-    process = run_script(*flags, cwd=tmp_path, script=SCRIPT)
-    assert process.returncode == 0 and process.stderr == "", process.stderr
-    rows = read_metrics(tmp_path / "runs/two")
+    assert ppo_rgb.main([*map(str, flags)]) == 0 and capfd.readouterr().err == ""
+    rows = read_metrics(in_tmp / "runs/two")
     train, evaluation = [[row for row in rows if row["kind"] == kind] for kind in ("train", "eval")]
     assert [row["global_step"] for row in train] == [60, 120, 180] and all(row["num_episodes"] >= 6 for row in train)
     assert [row["num_episodes"] for row in evaluation] == [4, 4, 4] and evaluation[0]["episode_len"] == 8
