@@ -1316,6 +1316,15 @@ solve_inverse_kinematics_of_batches()
 
 
 # ----- Actors: processes that simulate on a CPU -----------------------------------------------------------------------
+def raise_file_limit() -> None:
+    """Allow this process as many open files as the system lets it have."""
+    with contextlib.suppress(ImportError, ValueError, OSError):  # Windows has none, and macOS refuses its own limit
+        import resource
+
+        _, highest = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (highest, highest))
+
+
 def even_share(total: int, index: int, shares: int) -> range:
     """Which of `total` things belong to one of several equal shares."""
     return range(math.ceil(total * index / shares), math.ceil(total * (index + 1) / shares))
@@ -1414,6 +1423,7 @@ class Actors:
     """Actor 0 in this process and, with CPU simulation, each further one in a process of its own."""
 
     def __init__(self, args: Args, trajectory_dir: Path, closing: contextlib.ExitStack):
+        raise_file_limit()  # torch sends each actor its tensors as open files
         # Processes inherit this: they ignore these signals, and the main process ends them.
         handlers = set_handlers(dict.fromkeys(STOP_SIGNALS, signal.SIG_IGN))
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
@@ -1462,8 +1472,10 @@ class Actors:
         sums_of_actors = self.call("rollout", iteration, is_first)
         floats = [x for x in tree_leaves(self.storage) if x.is_floating_point()]
         is_broken = torch.stack([~x.isfinite().reshape(*x.shape[:2], -1).all(2).all(0) for x in floats]).any(0)
-        if any(all_gather(is_broken.any().item())):  # all processes stop together
-            raise RunError(f"the rollout has NaN or infinity in environments {is_broken.nonzero().flatten().tolist()}")
+        broken = all_gather(is_broken.nonzero().flatten().tolist())  # all processes stop together
+        if any(broken):
+            where = broken[0] if WORLD_SIZE == 1 else f"(of each process) {broken}"
+            raise RunError(f"the rollout has NaN or infinity in environments {where}")
         if self.learner_storage is not self.storage:
             tree_map(lambda new, old: new.copy_(old), self.learner_storage, self.storage)
         return sums_of_actors
@@ -1578,9 +1590,9 @@ class Checkpoints:
         self.run_info = dict(args=asdict(args), world_size=WORLD_SIZE, wandb_id=logger.wandb_id)
         obs_spaces = getattr(obs_space, "spaces", {"obs": obs_space})  # of a dict of images and state, or of a tensor
         self.run_info["obs_spaces"] = {k: (tuple(x.shape), x.dtype.name) for k, x in obs_spaces.items()}
-        self.contents, self.best_score = {}, resumed.get("best_score", [-math.inf])
-        if resumed and (run_dir / "best.pt").exists():  # it may be newer than the checkpoint
-            self.best_score = max(self.best_score, load_checkpoint(run_dir / "best.pt")["best_score"])
+        best = run_dir / "best.pt"  # only the first process has it, and it may be newer than the checkpoint
+        best_score = load_checkpoint(best)["best_score"] if resumed and best.exists() else [-math.inf]
+        self.contents, self.best_score = {}, all_gather(best_score)[0]
 
     def take(self, iteration: int, global_step: int) -> None:
         """Copy the state from which a resumed run goes on, and write it if that is due."""
@@ -1631,10 +1643,6 @@ class Logger:
             self.lock.acquire(timeout=0)
         except filelock.Timeout:
             fail(f"another process is writing to {run_dir}: stop it first, or choose another --exp_name")
-        path = run_dir / "metrics.jsonl"
-        path.touch()
-        os.truncate(path, min(path.stat().st_size, resumed.get("metrics_size", 0)))  # later steps are done again
-        self.file = open(path, "a")
         hardware = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{num_cores()} CPU core(s)"
         packages = ("mani-skill", "sapien", "torch", "gymnasium", "numpy")
         versions = {"python": platform.python_version()} | {p: importlib.metadata.version(p) for p in packages}
@@ -1647,6 +1655,10 @@ class Logger:
                 project=args.wandb_project_name, entity=args.wandb_entity, group=args.wandb_group, name=run_dir.name,
                 config=run_info, save_code=True, id=resumed.get("wandb_id"), resume="allow", sync_tensorboard=True,
             )  # fmt: skip
+        path = run_dir / "metrics.jsonl"  # only now: where it exists, a run has begun
+        path.touch()
+        os.truncate(path, min(path.stat().st_size, resumed.get("metrics_size", 0)))  # later steps are done again
+        self.file = open(path, "a")
         self.wandb_id, global_step = self.wandb_run and self.wandb_run.id, resumed.get("global_step", 0)
         self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
         self.bar = tqdm(
@@ -1692,7 +1704,7 @@ def plot_learning_curve(run_dir: Path) -> None:
     from matplotlib.figure import Figure
 
     rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
-    keys = [key for key in ("success_once", "success_at_end", "return") if key in rows[0]]
+    keys = [key for key in ("success_once", "success_at_end", "return") if any(key in row for row in rows)]
     figure = Figure(figsize=(5 * len(keys), 3.5), layout="constrained")
     for axis, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys):
         for kind, style in (("train", dict(alpha=0.4)), ("eval", dict(marker="o", markersize=3))):
@@ -1814,6 +1826,9 @@ def all_gather(x) -> list:
 def num_cores() -> int:
     """CPU cores for this process."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with contextlib.suppress(OSError, ValueError):  # the quota of a container; "max": it has none
+        quota, period = map(int, Path("/sys/fs/cgroup/cpu.max").read_text().split())
+        cores = min(cores, math.ceil(quota / period))
     return max(1, cores // LOCAL_WORLD_SIZE)
 
 
@@ -1837,6 +1852,7 @@ def parse_args(argv: list[str]) -> Args:
         num_envs = max(CPU_ENVS_PER_CORE * num_cores(), MIN_CPU_ENVS // WORLD_SIZE)
         num_envs = min(num_envs, MAX_CPU_ENVS // WORLD_SIZE) * WORLD_SIZE
         default = replace(default, **CPU_DEFAULTS, num_envs=num_envs, num_eval_envs=num_envs)
+    default.num_envs -= default.num_envs % WORLD_SIZE
     if given.evaluate and given.checkpoint is None:
         fail("--evaluate needs --checkpoint runs/NAME/best.pt")
     if given.resume is not None and (given.evaluate or given.checkpoint):
@@ -1874,6 +1890,9 @@ def check_resume(args: Args, checkpoint: dict) -> None:
     for k in FIXED_FLAGS:
         if getattr(args, k) != run.get(k):
             fail(f"the run has --{k} {run.get(k)}, not {getattr(args, k)}: start a new run to change that")
+    batch_size = run["num_envs"] * run["num_steps"]
+    if args.batch_size != batch_size:
+        fail(f"the run has {batch_size} steps an iteration, not {args.batch_size}: keep --num_envs x --num_steps")
     if (size := checkpoint["world_size"]) != WORLD_SIZE:
         fail(f"the run has {size} processes, not {WORLD_SIZE}: torchrun --nproc_per_node={size} ...")
     if args.num_iterations < checkpoint["iteration"]:
@@ -1959,6 +1978,8 @@ def check_task_flags(args: Args) -> None:
 def check_simulation(args: Args) -> None:
     """Refuse flags that do not fit the simulation, and a GPU that is not there or cannot be used."""
     on_gpu = args.sim_backend != "physx_cpu"
+    if on_gpu and not args.cuda:
+        fail(f"--no-cuda, and --sim_backend is {args.sim_backend}: give --sim_backend physx_cpu as well")
     if on_gpu and args.num_actors > WORLD_SIZE:
         fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
     if not on_gpu and args.num_envs + args.num_eval_envs > args.num_actors * MAX_SCENES_OF_PROCESS:
@@ -2049,6 +2070,8 @@ def main(argv: list[str]) -> int:
         print(f"learning curve, videos and metrics are in {run_dir}; to evaluate the best policy on other episodes:")
         print(f"    {command} --evaluate --checkpoint {run_dir / 'best.pt'} --eval_seed 1000")
     elif (run_dir / "last.pt").exists():
+        if WORLD_SIZE > 1:
+            command = f"torchrun --nproc_per_node={LOCAL_WORLD_SIZE} {sys.argv[0]}"
         print(f"{run_dir / 'last.pt'} is safe; to go on: {command} --resume {run_dir}", file=sys.stderr)
     return code
 

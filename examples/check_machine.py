@@ -115,7 +115,7 @@ def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> None:
 def show_shared_memory(cores: int) -> None:
     """With CPU simulation the process of each core writes what it sees there; with images that may be too much."""
     free = shutil.disk_usage("/dev/shm").free
-    num_envs = 32 * cores
+    num_envs = min(32 * cores, 512)
     steps = num_envs * max(5, 1600 // num_envs)
     side = math.isqrt(max(0, free - 16 * 2**20) // (3 * steps))  # the rest is for all that is no image
     found = f"{free / 2**20:,.0f} MiB free: "
@@ -140,6 +140,8 @@ def main() -> None:
     quota = read("/sys/fs/cgroup/cpu.max").split()
     limited = len(quota) == 2 and quota[0] != "max" and int(quota[0]) / int(quota[1])
     row(None, "cores", f"{cores}" + (f", and a quota allows {limited:.1f} of them" if limited else ""))
+    if limited:
+        cores = min(cores, math.ceil(limited))
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

@@ -139,6 +139,14 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
 
 
+@pytest.mark.parametrize("quota, expected", [("max 100000", 64), ("150000 100000", 2), ("5000 100000", 1), ("", 64)])
+def test_cores_of_a_container(monkeypatch, quota, expected):
+    """A container with a quota sees all cores of its host. It must not start a process on each."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(64))
+    monkeypatch.setattr(ppo.Path, "read_text", lambda path: quota)
+    assert ppo.num_cores() == expected
+
+
 @pytest.mark.parametrize("num_envs, num_steps", [(512, 8), (4096, 5), (16, 256)])
 def test_defaults_of_a_gpu(monkeypatch, num_envs, num_steps):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -158,6 +166,9 @@ def test_defaults_by_backend(monkeypatch):
         patch.setattr(ppo, "LOCAL_RANK", 1)
         local = ppo.local_args(ppo.parse_args([]))
         assert local.sim_backend == "physx_cuda:1" and local.num_envs == 256, "each process has its own GPU"
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "WORLD_SIZE", 3)
+        assert ppo.parse_args([]).num_envs == 510, "a multiple of the number of processes"
     assert args.num_eval_envs >= args.num_eval_episodes, "an evaluation must take one round of episodes"
     args = ppo.parse_args(["--sim_backend", "physx_cuda:1", "--num_envs", "4096", "--num-steps", "4"])
     assert ppo.choose_device(args) == torch.device("cuda:1") and args.num_minibatches == 4

@@ -4,6 +4,7 @@ the command with real tasks."""
 import contextlib
 import errno
 import gc
+import json
 import math
 import multiprocessing
 import os
@@ -162,10 +163,43 @@ def test_best_checkpoint_is_never_replaced_by_a_worse_one(train, in_tmp):
     assert Path("runs/run1/best.pt").read_bytes() == before
 
 
+def test_a_best_policy_that_was_not_written_is_found_again(train, in_tmp, monkeypatch, signals):
+    """A signal while best.pt is written: its score is not that of the file, and must not keep the next one out."""
+    write, scores = ppo.Checkpoints.write, iter([1, 1, 2, 2, 2, 2, 0, 0])  # the best ones count twice: see train
+    monkeypatch.setattr(ppo, "score", lambda episodes: [next(scores)])
+
+    def stop_in_the_second(checkpoints, name):
+        if name == "best.pt" and Path("runs/run1/best.pt").exists():
+            signal_self()
+        write(checkpoints, name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo.Checkpoints, "write", stop_in_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            train(**RUN)
+    assert [ppo.load_checkpoint(f"runs/run1/{x}.pt")["best_score"] for x in ("best", "last")] == [[1], [2]]
+    train(**RUN, resume="runs/run1")
+    assert ppo.load_checkpoint("runs/run1/best.pt")["best_score"] == [2]
+
+
+def test_processes_agree_on_the_best_score(train, in_tmp, monkeypatch):
+    """Only the first process of torchrun has best.pt. All must agree when an evaluation is repeated."""
+    train(**RUN)
+    resumed = ppo.load_checkpoint("runs/run1/last.pt")
+    agent, optimizer = SimpleNamespace(), SimpleNamespace()
+    logger, space = SimpleNamespace(wandb_id=None), box(4)
+    monkeypatch.setattr(ppo, "all_gather", lambda x: [[1.5, 30.0], x])
+    other = ppo.Checkpoints(SMALL, in_tmp / "nothing", resumed, agent, optimizer, space, logger)
+    assert other.best_score == [1.5, 30.0]
+
+
 @on_cpu_and_cuda
 def test_resume_to_fewer_or_as_many_steps(train, in_tmp, capsys):
-    """Fewer steps are refused. With as many, the script prints that the run is finished. Neither changes the run."""
+    """Fewer steps and iterations of another size are refused. With as many steps, the script prints that the run is
+    finished. None of these changes the run."""
     metrics, _ = train(total_timesteps=320 * 4)
+    for flag in ("--num_envs=64", "--num_steps=0"):
+        assert "the run has 320 steps an iteration" in refused(["--resume", "runs/run1", flag], capsys)
     for steps, code, words in ((320 * 3, 2, "the run already has 1280 steps"), (320 * 4, 0, "the run is finished")):
         with pytest.raises(SystemExit) as error:
             ppo.main(["--resume", "runs/run1", "--total_timesteps", str(steps)])
@@ -601,6 +635,25 @@ def test_a_run_folder_has_one_writer(train, in_update, in_tmp, capsys):
     assert lines == ["ppo.py: another process is writing to runs/run1: stop it first, or choose another --exp_name\n"]
     assert [row["iteration"] for row in metrics if row["kind"] == "train"] == [*range(1, 13)]
     train(**RUN | dict(total_timesteps=320 * 13), resume="runs/run1")  # the lock is free again
+
+
+def test_many_actors_may_open_many_files(train):
+    """Each actor takes the agent and the storage as some thirty open files. The usual limit is 1,024."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit[1] // 2, limit[1]))
+        train(total_timesteps=320)
+        assert resource.getrlimit(resource.RLIMIT_NOFILE) == (limit[1], limit[1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+
+
+def test_a_learning_curve_that_begins_without_an_episode(tmp_path):
+    """So it is in the other processes of torchrun after a resume, if no episode ended in the first iteration."""
+    rows = [dict(kind="train", global_step=320), dict(kind="eval", global_step=640, success_once=0.5)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    ppo.plot_learning_curve(tmp_path)
+    assert (tmp_path / "learning_curve.png").exists()
 
 
 @pytest.mark.slow

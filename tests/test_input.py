@@ -181,6 +181,11 @@ def test_exact_resume_on_a_gpu_is_refused(in_tmp, capsys):
     assert "needs CPU simulation" in refused(["--sim_backend", "physx_cuda", "--exact_resume"], capsys)
 
 
+def test_no_cuda_with_simulation_on_a_gpu_is_refused(in_tmp, capsys):
+    """A resumed run brings its simulation along: the line says how to change that."""
+    assert "give --sim_backend physx_cpu as well" in refused(["--sim_backend", "physx_cuda", "--no-cuda"], capsys)
+
+
 def test_driver_too_old(in_tmp, capsys, monkeypatch):
     """With physx_cuda, the script refuses to run and prints the reason. Else it prints it, and learns on the CPU."""
 
