@@ -153,7 +153,7 @@ class Args:
     obs_mode: str = "state"
     """what the policy sees: this script supports state only, ppo_rgb.py supports images"""
     control_mode: Optional[str] = "pd_joint_delta_pos"
-    """controller of the robot (None: the robot's default)"""
+    """controller of the robot (None: the task's default, or else the robot's)"""
     robot_uids: Optional[str] = None
     """robot (None: the task's default)"""
     reward_mode: Optional[Literal["normalized_dense", "dense", "sparse", "none"]] = None
@@ -169,7 +169,7 @@ class Args:
     num_actors: Optional[int] = None
     """number of processes that simulate on a CPU, each its part of the environments (None: one a core)"""
     partial_reset: bool = True
-    """end a training episode at success or failure; --no-partial_reset: only at the time limit"""
+    """end a training episode after success or at failure; --no-partial_reset: only at the time limit"""
     success_steps: float = 10.0
     """steps of success before a training episode ends, on average, so that the policy learns to stay (1: the first)"""
     staggered_resets: bool = True

@@ -27,8 +27,8 @@ def steps_per_second(ranks, options):
         steps = next((int(a) for f, a in zip(options.flags, options.flags[1:]) if f == "--num_steps"), 50)
         batch = options.num_envs * steps * ranks
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", ranks, SCRIPT,
-                   "--num_envs", options.num_envs * ranks, "--total_timesteps", batch * options.iterations,
-                   "--exp_name", "x", "--eval_freq", 0, "--num_eval_envs", ranks, "--num_eval_episodes", ranks,
+                   "--num_envs", options.num_envs * ranks, "--num_steps", steps, "--exp_name", "x",
+                   "--total_timesteps", batch * options.iterations, "--eval_freq", 0, "--num_eval_envs", ranks, "--num_eval_episodes", ranks,
                    "--no-capture_video", *options.flags]  # fmt: skip
         subprocess.run([*map(str, command)], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]

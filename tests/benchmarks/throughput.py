@@ -35,7 +35,7 @@ SCRIPT = Path(ppo.__file__)
 
 def ours(iterations):
     """Run ppo.py as a command; returns the steps per second of each iteration after the first."""
-    flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None --desired_kl None "
+    flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None --desired_kl None --no-anneal_lr "
              f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations} --eval_freq 0 --num_eval_episodes 2 "
              "--num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
