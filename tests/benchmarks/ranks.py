@@ -29,7 +29,8 @@ def steps_per_second(ranks, options):
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", ranks, SCRIPT,
                    "--num_envs", options.num_envs * ranks, "--num_steps", steps, "--exp_name", "x",
                    "--total_timesteps", batch * options.iterations, "--eval_freq", 0,
-                   "--num_eval_envs", ranks, "--num_eval_episodes", ranks, "--no-capture_video", *options.flags]  # fmt: skip
+                   "--num_eval_envs", ranks, "--num_eval_episodes", ranks, "--no-capture_video",
+                   *options.flags]  # fmt: skip
         subprocess.run([*map(str, command)], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]
     rows = [row for row in rows if row["kind"] == "train"][2:]
