@@ -185,7 +185,8 @@ class Args:
     eval_partial_reset: bool = False
     """end an evaluation episode at success or failure"""
     reconfiguration_freq: Optional[int] = None
-    """rebuild the training scenes every so many resets (None: the task's default); needs --no-partial_reset"""
+    """rebuild the training scenes every so many resets; needs --no-partial_reset (None: the task's default, or on a CPU
+    after ten episodes if the task varies its objects)"""
     eval_reconfiguration_freq: Optional[int] = None
     """rebuild the evaluation scenes every so many resets (None: 1 if the task varies its objects, else never)"""
     render_mode: Literal["rgb_array", "sensors", "all"] = "all"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Commands for ManiSkill's own tasks. Run one by its name, with further flags if you like:
+# Commands for ManiSkill's tasks and those in this folder. Run one by its name, with further flags if you like:
 #
 #     bash examples/recipes.sh push_cube_cpu --seed 3
 #
@@ -8,7 +8,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# --- states, CPU: manipulation in short episodes, with the default flags ---
+# --- states, CPU: manipulation in short episodes, with the default flags unless a comment says why not ---
 
 tabletop() { python ppo.py --no-cuda --eval_freq 20 "$@"; }
 
@@ -51,11 +51,10 @@ push_to_goal_cpu() {
     tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 800000 "$@"
 }
 
-# The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. The cube has
-# far to go, so gamma is larger. Training episodes go on after success: if they ended, the arm would learn to go
-# just far enough, and often stop short.
+# The task's own controller: with the default of ppo.py, the arm lags behind its target, and time runs out. Training
+# episodes go on to the time limit: if they ended sooner, the arm would learn to go just far enough, and often stop short.
 grasp_cube_so100_cpu() {
-    tabletop --env_id SO100GraspCube-v1 --control_mode pd_joint_target_delta_pos --gamma 0.9 --ent_coef 0.003 \
+    tabletop --env_id SO100GraspCube-v1 --control_mode pd_joint_target_delta_pos --ent_coef 0.003 \
         --no-partial_reset --total_timesteps 2400000 "$@"
 }
 
