@@ -1473,10 +1473,9 @@ class Actors:
         sums_of_actors = self.call("rollout", iteration, is_first)
         floats = [x for x in tree_leaves(self.storage) if x.is_floating_point()]
         is_broken = torch.stack([~x.isfinite().reshape(*x.shape[:2], -1).all(2).all(0) for x in floats]).any(0)
-        broken = all_gather(is_broken.nonzero().flatten().tolist())  # all processes stop together
-        if any(broken):
-            where = broken[0] if WORLD_SIZE == 1 else f"(of each process) {broken}"
-            raise RunError(f"the rollout has NaN or infinity in environments {where}")
+        if any(all_gather(is_broken.any().item())):  # all processes stop together
+            broken = ", ".join(map(str, all_gather(is_broken.nonzero().flatten().tolist())))  # a list of each process
+            raise RunError(f"the rollout has NaN or infinity in environments {broken}")
         if self.learner_storage is not self.storage:
             tree_map(lambda new, old: new.copy_(old), self.learner_storage, self.storage)
         return sums_of_actors
