@@ -697,9 +697,9 @@ def test_kill_at_random_moments(tmp_path):
 
 
 @pytest.mark.slow
-def test_memory_is_flat(tmp_path, num_iterations=500):
-    """The main process and the other actor do not grow over 500 iterations and 40 rebuilds of the scenes."""
-    flags = ("--exact_resume", "--checkpoint_freq", 12, "--env_id", "MS-CartpoleBalance-v1", "--num_envs", 4,
+def test_memory_is_flat(tmp_path, num_iterations=1000):
+    """The main process and the other actor do not grow over 1,000 iterations and 40 rebuilds of the scenes."""
+    flags = ("--exact_resume", "--checkpoint_freq", 25, "--env_id", "MS-CartpoleBalance-v1", "--num_envs", 4,
              "--env_kwargs", '{"max_episode_steps": 50}', "--num_actors", 2, "--num_eval_envs", 4, "--num_steps", 2,
              "--num_eval_episodes", 4, "--num_minibatches", 1, "--update_epochs", 1, "--eval_freq", 200, "--no-cuda",
              "--no-capture_video", "--exp-name", "x", "--total_timesteps", 8 * num_iterations)  # fmt: skip
