@@ -161,7 +161,7 @@ class Args:
     sim_backend: str = "auto"
     """physx_cuda (all environments on one GPU; physx_cuda:1 is the second GPU), physx_cpu, or auto"""
     render_backend: str = "gpu"
-    """device that renders videos: gpu (gpu:1), cpu or none; a missing device is replaced by one that exists"""
+    """device that renders videos: gpu (gpu:1 is the second one) or none; without CUDA, any Vulkan device renders"""
     num_envs: int = 512
     """number of parallel training environments"""
     num_eval_envs: int = 64
@@ -239,7 +239,7 @@ class Args:
     logstd_final: Optional[float] = None
     """upper limit of that logarithm, which falls from logstd_init over the second half of the run (None: no limit)"""
     compile: bool = False
-    """compile the network with torch.compile, which takes a minute"""
+    """compile the network with torch.compile: the run starts later, by up to a minute"""
     cudagraphs: bool = True
     """on a GPU, launch a step of the policy, values, and an epoch of the update as one CUDA graph each"""
     # --- Evaluation, checkpoints, videos ---
@@ -336,7 +336,8 @@ class GoOnAfterSuccess(gym.Wrapper):
 
 
 def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
-    """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
+    """`num_envs` environments as one ManiSkill environment. Put your wrappers here. One that changes observations gives
+    ManiSkill an example of the new ones: env.unwrapped.update_obs_space(obs)."""
     modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
     kwargs = dict(
         num_envs=num_envs,
@@ -468,7 +469,7 @@ def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_h
 
 
 def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.optim.Optimizer:
-    """Adam with one group each for the policy's mean, its standard deviation and the critic."""
+    """Adam with one group each for `actor_logstd`, for `critic`, and for all else."""
     special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
     actor = [p for p in agent.parameters() if id(p) not in special]
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
@@ -926,8 +927,15 @@ def find_reset_error(envs: ManiSkillVectorEnv) -> Optional[Exception]:
 
 def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     """Refuse partial resets that the task cannot do; print a note if gamma does not suit the length of its episodes."""
+    obs, info = envs.reset()
+    spaces = getattr(envs.single_observation_space, "spaces", {"obs": envs.single_observation_space})
+    for k, space in spaces.items():
+        x = obs[k] if isinstance(obs, dict) else obs
+        if (x.shape[1:], x.dtype) != (space.shape, getattr(torch, space.dtype.name)):
+            raise RunError(f"observations are {x.dtype} {tuple(x.shape[1:])}, and their space has {space.dtype} "
+                           f"{space.shape}: a wrapper that changes them must call update_obs_space")  # fmt: skip
     reset_error = find_reset_error(envs)
-    if args.partial_reset and reset_error and {"success", "fail"} & envs.reset()[1].keys():
+    if args.partial_reset and reset_error and {"success", "fail"} & info.keys():
         fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
              f"resets all; --sim_backend physx_cpu --num_actors {args.num_envs} gives each a process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
@@ -1511,7 +1519,8 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
 
     stored = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
     num_rows = args.batch_size // args.num_minibatches + 2 * args.num_envs  # a gradient, acting, final values
-    used = stored + num_rows * layers_size(agent, storage)
+    weights = sum(x.numel() * x.element_size() for x in agent.parameters())
+    used = stored + num_rows * layers_size(agent, storage) + 3 * weights  # gradients, and Adam's two moments
     places = []
     if device.type == "cpu":
         places.append(("memory", psutil.virtual_memory().available / LOCAL_WORLD_SIZE, used))
@@ -1522,7 +1531,7 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
         places.append(("the GPU's memory", torch.cuda.mem_get_info(learner_device)[0], used))
     for place, free, needed in places:
         if needed > 0.9 * free:
-            remedy = f"--num_steps {args.num_steps // 2}, fewer --num_envs, more --num_minibatches or smaller images"
+            remedy = f"--num_steps {args.num_steps // 2}, more --num_minibatches or smaller images"
             needed, free = (f"{size / 2**20:,.0f} MiB" for size in (needed, free))
             fail(f"training needs {needed}, and {free} of {place} are free: try {remedy}")
     return tree_map(lambda x: torch.zeros_like(x, device=device), storage)

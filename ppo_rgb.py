@@ -153,9 +153,9 @@ class Args:
     obs_mode: str = "rgb"
     """textures of the cameras' images, joined by +: rgb, depth, segmentation, position, normal, albedo"""
     include_state: bool = True
-    """see the robot's state too, and whatever else the task shows besides images; --no-include_state: images alone"""
+    """see the robot's state and the task's other numbers as well; --no-include_state: images alone"""
     frame_stack: int = 1
-    """see the last so many observations together"""
+    """number of latest observations that the policy sees together; they take as much more memory"""
     camera_width: Optional[int] = None
     """width of the images in pixels (None: the task's default)"""
     camera_height: Optional[int] = None
@@ -169,7 +169,7 @@ class Args:
     sim_backend: str = "auto"
     """physx_cuda (all environments on one GPU; physx_cuda:1 is the second GPU), physx_cpu, or auto"""
     render_backend: str = "gpu"
-    """device that renders: gpu (gpu:1) or cpu; a missing device is replaced by one that exists"""
+    """device that renders: gpu (gpu:1 is the second one); without CUDA, any Vulkan device renders"""
     num_envs: int = 256
     """number of parallel training environments"""
     num_eval_envs: int = 64
@@ -197,7 +197,7 @@ class Args:
     """further arguments of gym.make as JSON, such as '{"sensor_configs": {"fov": 0.6}}'"""
     # --- PPO ---
     total_timesteps: Optional[int] = None
-    """total number of environment steps (None: as many as PushCube-v1 needs; other tasks need more)"""
+    """total number of environment steps (None: 150 iterations; many tasks need more)"""
     learning_rate: float = 3e-4
     """Adam's learning rate"""
     critic_learning_rate: Optional[float] = None
@@ -245,7 +245,7 @@ class Args:
     channels_last: bool = True
     """keep the convolutions' tensors in channels-last order"""
     amp: bool = False
-    """run the encoder in bfloat16 (automatic mixed precision)"""
+    """run the encoder in bfloat16 (automatic mixed precision); slow on a CPU, and no faster on an H200"""
     norm_obs: bool = False
     """normalise the state by its running mean and variance"""
     layer_norm: bool = False
@@ -255,7 +255,7 @@ class Args:
     logstd_final: Optional[float] = None
     """upper limit of that logarithm, which falls from logstd_init over the second half of the run (None: no limit)"""
     compile: bool = False
-    """compile the network with torch.compile, which takes a minute"""
+    """compile the network with torch.compile: the run starts later, by up to a minute"""
     cudagraphs: bool = True
     """on a GPU, launch a step of the policy, values, and an epoch of the update as one CUDA graph each"""
     # --- Evaluation, checkpoints, videos ---
@@ -308,7 +308,7 @@ GPU_BATCH_SIZE = 12800  # steps of an iteration, unless num_steps is given
 CPU_BATCH_SIZE = 1600
 NUM_ITERATIONS = 150  # unless total_timesteps is given
 MIN_CPU_ENVS = 32
-CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 512  # with more, an iteration has more steps than PPO can use
+CPU_ENVS_PER_CORE, MAX_CPU_ENVS = 32, 64  # a larger batch would not render faster
 UPDATE_THREADS_PER_CORE = 1.0  # in ppo.py, with its small layers, half of them are faster
 TEXTURES = {"rgb": 3, "depth": 1, "segmentation": 1, "position": 3, "normal": 3, "albedo": 3}  # and their channels
 
@@ -436,7 +436,8 @@ class GoOnAfterSuccess(gym.Wrapper):
 
 
 def make_env(args: Args, num_envs: int, evaluation: bool = False, film: bool = False) -> gym.Env:
-    """`num_envs` environments as one ManiSkill environment. Put your wrappers here."""
+    """`num_envs` environments as one ManiSkill environment. Put your wrappers here. One that changes observations gives
+    ManiSkill an example of the new ones: env.unwrapped.update_obs_space(obs)."""
     modes = find_task(args.env_id).cls.SUPPORTED_REWARD_MODES
     kwargs = dict(
         num_envs=num_envs,
@@ -484,7 +485,8 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Textures of a batch of observations to features, float32 (batch, 256). Replace it by your own.
+    """Textures of a batch of observations to features, float32 (batch, 256). Replace it by your own, without dropout or
+    BatchNorm: acting and learning must compute the same.
 
     "nature" is the network of Mnih et al. 2015 (doi 10.1038/nature14236), "impala" the residual one of Espeholt et al.
     2018 (arXiv 1802.01561, fig. 3), both on all textures, cameras and frames as channels of one image."""
@@ -654,7 +656,7 @@ def compute_gae(rewards, values, next_values, dones, gamma, gae_lambda, finite_h
 
 
 def make_optimizer(agent: nn.Module, args: Args, device: torch.device) -> torch.optim.Optimizer:
-    """Adam with one group each for the policy's mean, its standard deviation and the critic."""
+    """Adam with one group each for `actor_logstd`, for `critic`, and for all else."""
     special = {id(p) for p in (agent.actor_logstd, *agent.critic.parameters())}
     actor = [p for p in agent.parameters() if id(p) not in special]
     critic_lr = args.learning_rate if args.critic_learning_rate is None else args.critic_learning_rate
@@ -1127,8 +1129,15 @@ def find_reset_error(envs: ManiSkillVectorEnv) -> Optional[Exception]:
 
 def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     """Refuse partial resets that the task cannot do; print a note if gamma does not suit the length of its episodes."""
+    obs, info = envs.reset()
+    spaces = getattr(envs.single_observation_space, "spaces", {"obs": envs.single_observation_space})
+    for k, space in spaces.items():
+        x = obs[k] if isinstance(obs, dict) else obs
+        if (x.shape[1:], x.dtype) != (space.shape, getattr(torch, space.dtype.name)):
+            raise RunError(f"observations are {x.dtype} {tuple(x.shape[1:])}, and their space has {space.dtype} "
+                           f"{space.shape}: a wrapper that changes them must call update_obs_space")  # fmt: skip
     reset_error = find_reset_error(envs)
-    if args.partial_reset and reset_error and {"success", "fail"} & envs.reset()[1].keys():
+    if args.partial_reset and reset_error and {"success", "fail"} & info.keys():
         fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
              f"resets all; --sim_backend physx_cpu --num_actors {args.num_envs} gives each a process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
@@ -1712,7 +1721,8 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
 
     stored = sum(x.numel() * x.element_size() for x in tree_leaves(storage))
     num_rows = args.batch_size // args.num_minibatches + 2 * args.num_envs  # a gradient, acting, final values
-    used = stored + num_rows * layers_size(agent, storage)
+    weights = sum(x.numel() * x.element_size() for x in agent.parameters())
+    used = stored + num_rows * layers_size(agent, storage) + 3 * weights  # gradients, and Adam's two moments
     places = []
     if device.type == "cpu":
         places.append(("memory", psutil.virtual_memory().available / LOCAL_WORLD_SIZE, used))
@@ -1723,7 +1733,7 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
         places.append(("the GPU's memory", torch.cuda.mem_get_info(learner_device)[0], used))
     for place, free, needed in places:
         if needed > 0.9 * free:
-            remedy = f"--num_steps {args.num_steps // 2}, fewer --num_envs, more --num_minibatches or smaller images"
+            remedy = f"--num_steps {args.num_steps // 2}, more --num_minibatches or smaller images"
             needed, free = (f"{size / 2**20:,.0f} MiB" for size in (needed, free))
             fail(f"training needs {needed}, and {free} of {place} are free: try {remedy}")
     return tree_map(lambda x: torch.zeros_like(x, device=device), storage)

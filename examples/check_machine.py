@@ -113,11 +113,10 @@ def row(good: Optional[bool], name: str, found: str, remedy: str = "") -> None:
 
 
 def show_shared_memory(cores: int) -> None:
-    """With CPU simulation the process of each core writes what it sees there; with images that may be too much."""
+    """With CPU simulation, each process writes its observations to shared memory. Images may be too much."""
     free = shutil.disk_usage("/dev/shm").free
-    num_envs = min(32 * cores, 512)
-    steps = num_envs * max(5, 1600 // num_envs)
-    side = math.isqrt(max(0, free - 16 * 2**20) // (3 * steps))  # the rest is for all that is no image
+    steps = 1600
+    side = math.isqrt(max(0, int(0.9 * free) - 16 * 2**20) // (3 * steps))  # the rest is for all that is no image
     found = f"{free / 2**20:,.0f} MiB free: "
     if cores == 1:
         found += "one core needs none"

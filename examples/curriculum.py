@@ -1,4 +1,4 @@
-"""A self-paced curriculum: push the cube further as it is pushed more surely.
+"""A self-paced curriculum: the goal moves away as the policy succeeds more often.
 
     python ppo.py --env_id examples.curriculum:PushFurther-v1
 
@@ -9,13 +9,15 @@ It teaches more than examples/push_to_goal.py: how reset's `options` set what an
 when training resets by itself. ManiSkillVectorEnv resets the environments whose episodes ended with
 `options={"env_idx": ...}` and nothing else. So `reset`, below, adds the difficulty:
 
-* An episode that starts from a seed has full difficulty. Evaluations start so, and measure the task itself.
-* A training episode has the level of its environment. Success raises the level, failure lowers it three times as much:
-  it stays where three of four episodes succeed (the weighted up-down method: Kaernbach 1991, eq. 1).
+* An episode that starts from a seed has full difficulty. Evaluations start so, and measure the task itself. So does
+  each environment's first training episode.
+* Any other training episode has the level of its environment. Success raises the level, failure lowers it three times
+  as much: it stays where three of four episodes succeed (the weighted up-down method: Kaernbach 1991, eq. 1).
 * `options={"difficulty": d}` gives episodes of difficulty d, between 0 and 1, one number or (b,).
 
-`evaluate` returns `level`, so that ppo.py logs it (train/final_level). It is not in checkpoints: a resumed run starts
-at level 0 again, climbs within some ten episodes of each environment, and is not exact with --exact_resume.
+`evaluate` returns `level`, so that ppo.py logs it as train/final_level (eval/final_level stays 0). It is not in
+checkpoints: a resumed run starts at level 0 again, climbs within some ten episodes of each environment, and is not
+exact with --exact_resume.
 """
 
 import numpy as np
@@ -23,6 +25,7 @@ import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
+# copy that file as well, and import it from where it lies then
 from examples.push_to_goal import PushToGoalEnv
 
 

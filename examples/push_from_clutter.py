@@ -9,9 +9,10 @@ It teaches more than examples/push_to_goal.py:
 
 * Placing without overlap, with ManiSkill's UniformPlacementSampler: see `_free_places`.
 * Domain randomisation. Sizes, masses and friction differ between environments and belong in `_load_scene`: on a GPU
-  they cannot change once the simulation has started, so a thousand environments have a thousand different scenes for
-  good. A scene of one environment is rebuilt now and then instead: see `reset` and `reconfiguration_freq`. Poses,
-  velocities and goals belong in `_initialize_episode`.
+  they cannot change once the simulation has started, so a thousand environments keep a thousand different scenes. On a
+  CPU, ppo.py builds new scenes after ten episodes, and each evaluation has new ones. A scene of a single environment is
+  built again now and then: see `reset` and `reconfiguration_freq`. Poses, velocities and goals belong in
+  `_initialize_episode`.
 """
 
 import sapien
@@ -23,6 +24,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 from sapien.physx import PhysxMaterial
 
+# copy that file as well, and import it from where it lies then
 from examples.push_to_goal import PushToGoalEnv
 
 

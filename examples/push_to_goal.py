@@ -34,7 +34,8 @@ class PushToGoalEnv(BaseEnv):
     goal_radius = 0.05
 
     def __init__(self, *args, robot_uids="panda", enhanced_determinism=True, **kwargs):
-        # enhanced_determinism: each environment draws its episodes from a stream of its own, TableSceneBuilder's too
+        # enhanced_determinism: each environment draws its episodes from a stream of its own (for a Panda, and for a few
+        # other robots, TableSceneBuilder does so as well)
         super().__init__(*args, robot_uids=robot_uids, enhanced_determinism=enhanced_determinism, **kwargs)
 
     @property
@@ -65,7 +66,6 @@ class PushToGoalEnv(BaseEnv):
             self.scene, self.goal_radius, thickness=1e-5, name="goal", body_type="kinematic", add_collision=False,
             initial_pose=sapien.Pose(p=[0.2, 0, 1e-3]),
         )  # fmt: skip
-        self._hidden_objects.append(self.goal)  # from the policy's cameras, not from videos; the state has it
         self.first_distance = torch.zeros(self.num_envs, device=self.device)  # a tensor of our own: num_envs rows
 
     # --- how an episode starts ---

@@ -46,7 +46,7 @@ poke_cube_cpu() {
     stages --env_id PokeCube-v1 --num_envs 512 --num_steps 8 --gamma 0.95 --ent_coef 0.003 --total_timesteps 3000000 "$@"
 }
 
-# With the default flags, the mean of the policy often stops just short of the goal: its noise did the last centimetres.
+# With the default flags, the mean of the policy often stops just short of the goal: in training, noise moved it on.
 push_to_goal_cpu() {
     tabletop --env_id examples.push_to_goal:PushToGoal-v1 --layer_norm --logstd_final -3 --total_timesteps 800000 "$@"
 }
@@ -102,7 +102,7 @@ cartpole_balance_images_cpu() {
         --env_kwargs '{"sensor_configs": {"fov": 0.6}}' --total_timesteps 72000 "$@"
 }
 
-# --- states, GPU: with all of ManiSkill's defaults that differ from ours, so that they do here what they do there ---
+# --- states, GPU: with all of ManiSkill's defaults that differ from ours, so that both train alike ---
 
 maniskill() {
     python "$1" --num_steps 50 --num_minibatches 32 --update_epochs 8 --learning_rate 3e-4 --no-anneal_lr --gamma 0.8 \

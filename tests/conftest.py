@@ -146,6 +146,7 @@ def train(in_tmp, monkeypatch, device, script, small):
     them, because a graph does not call what a test puts in place of a function."""
     monkeypatch.setattr(script, "make_envs", functools.partial(batched_env.make_envs, device=device))
     monkeypatch.setattr(script, "plot_learning_curve", lambda run_dir: None)  # plotting takes longer than these runs
+    monkeypatch.setattr(script, "num_cores", lambda: 2)  # more threads would be slower than these minibatches
     count = 0
 
     def run(**flags):

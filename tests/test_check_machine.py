@@ -49,7 +49,7 @@ def test_shared_memory(monkeypatch, capsys):
         (
             64,
             2,
-            "missing  shared memory             64 MiB free: enough for states, and for colour images of up to 102x102",
+            "missing  shared memory             64 MiB free: enough for states, and for colour images of up to 95x95",
         ),
         (8, 2, "missing  shared memory             8 MiB free: hardly enough for states"),
         (8, 1, "ok       shared memory             8 MiB free: one core needs none"),
@@ -64,7 +64,7 @@ def test_shared_memory(monkeypatch, capsys):
     action_space, cpu = ppo_rgb.gym.spaces.Box(-1, 1, (8,)), torch.device("cpu")
     args = ppo_rgb.Args(num_envs=64, num_steps=25, num_actors=2)
     make_storage = lambda *spaces: ppo_rgb.make_storage(ppo_rgb.Agent(*spaces, args), *spaces, args, cpu)
-    assert make_storage(obs_space(102), action_space)["obs"]["rgb"].shape[:2] == (25, 64)
+    assert make_storage(obs_space(95), action_space)["obs"]["rgb"].shape[:2] == (25, 64)
     with pytest.raises(SystemExit):
         make_storage(obs_space(120), action_space)
 

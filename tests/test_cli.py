@@ -13,9 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_script, same_weights
+from conftest import NO_VULKAN, ROOT, Stop, crash, read_metrics, refused, run_script, same_weights, scalars
 
 import ppo
+import ppo_rgb
 
 TINY = ("--num_envs", 1, "--num_eval_envs", 1, "--num_eval_episodes", 2, "--num_steps", 20, "--total_timesteps", 40,
         "--num_minibatches", 2, "--no-cuda", "--exp-name", "tiny")  # fmt: skip
@@ -46,22 +47,58 @@ def test_run_folder(trained):
 
 
 def test_tensorboard_holds_the_same_numbers(trained):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     folder, *_ = trained
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    rows = read_metrics(folder)
-    for kind, key in (("train", "sps"), ("train", "value_loss"), ("eval", "return")):
-        logged = [(e.step, e.value) for e in events.Scalars(f"{kind}/{key}")]
-        expected = [(row["global_step"], row[key]) for row in rows if row["kind"] == kind]
-        assert [s for s, _ in logged] == [s for s, _ in expected]
-        assert [v for _, v in logged] == pytest.approx([v for _, v in expected])
+    rows, logged = read_metrics(folder), scalars(folder)
+    for kind, key in (("train", "learning_rate"), ("train", "value_loss"), ("eval", "return")):
+        expected = {row["global_step"]: row[key] for row in rows if row["kind"] == kind}
+        assert logged[f"{kind}/{key}"] == pytest.approx(expected)
+
+
+def test_load_agent(trained):
+    """As in README: a policy for another program, and environments that fit."""
+    path = trained[0] / "last.pt"
+    agent, args = ppo.load_agent(path)
+    envs = ppo.make_envs(args, 2, 0, evaluation=True)
+    obs, _ = envs.reset(seed=[0, 1])
+    with torch.no_grad():
+        action = agent.get_action(obs)
+    envs.step(action)
+    envs.close()
+    assert action.shape == (2, 8) and not agent.training
+    assert same_weights({"agent": agent.state_dict()}, ppo.load_checkpoint(path))
+
+
+class Wandb:
+    """Stands in for the package: remembers what it is given, and names the run "the-run"."""
+
+    __spec__ = "found"
+
+    def __init__(self):
+        self.inits, self.exit_codes = [], []
+
+    def init(self, **kwargs):
+        self.inits.append(kwargs)
+        return SimpleNamespace(id="the-run", finish=lambda exit_code: self.exit_codes.append(exit_code))
+
+
+def test_weights_and_biases(in_tmp, monkeypatch):
+    """A resumed run goes on as the same run there, and one that fails says so."""
+    wandb = Wandb()
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    flags = (*TINY, "--track", "--no-capture_video", "--env_id", "MS-CartpoleBalance-v1")
+    flags += ("--wandb_group", "mine", "--env_kwargs", '{"max_episode_steps": 3}')
+    assert ppo.main([*map(str, flags)]) == 0
+    assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "60"]) == 0
+    monkeypatch.setattr(ppo, "rollout", crash)
+    assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "80"]) == 1
+    assert [init["id"] for init in wandb.inits] == [None, "the-run", "the-run"]
+    assert wandb.exit_codes == [0, 0, 1]
+    assert all(init["name"] == "tiny" and init["group"] == "mine" for init in wandb.inits)
 
 
 def test_evaluate_needs_the_checkpoint_alone(trained, tmp_path, monkeypatch, capsys):
     folder, *_ = trained
-    command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video", "--num_actors", 1)
+    command = ("--evaluate", "--checkpoint", folder / "last.pt", "--no-capture_video", "--num_actors", 1, "--no-cuda")
     monkeypatch.chdir(tmp_path)
     assert ppo.main([*map(str, command), "--num_eval_episodes", "5", "--eval-seed", "100"]) == 0
     output = capsys.readouterr().out
@@ -137,6 +174,15 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
     assert ppo.parse_args(["--no-cuda", "--num_envs", "4096"]).num_actors == max(cores, 6), "800 in a process"
     assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
+
+
+@pytest.mark.parametrize("cores, num_envs, num_steps", [(1, 32, 50), (2, 64, 25), (16, 64, 25), (128, 64, 25)])
+def test_defaults_for_images_by_cores(monkeypatch, cores, num_envs, num_steps):
+    """Pictures are rendered one after the other, so more cores have smaller shares of the same environments."""
+    monkeypatch.setattr(ppo_rgb, "num_cores", lambda: cores)
+    args = ppo_rgb.parse_args(["--no-cuda"])
+    assert (args.num_envs, args.num_eval_envs, args.num_steps) == (num_envs, num_envs, num_steps)
+    assert args.num_actors == min(cores, num_envs) and args.num_iterations == 150
 
 
 @pytest.mark.parametrize("quota, expected", [("max 100000", 64), ("150000 100000", 2), ("5000 100000", 1), ("", 64)])
@@ -434,8 +480,8 @@ def test_a_video_that_cannot_be_made_does_not_end_the_run(in_tmp, capsys, monkey
 def test_learns_a_task_of_maniskill(tmp_path):
     """The command learns a task that is cheap to simulate, with most flags at their defaults."""
     flags = ("--env_id", "MS-CartpoleBalance-v1", "--gamma", 0.99, "--gae_lambda", 0.95, "--total_timesteps", 32_000,
-             "--eval_freq", 0, "--num_eval_envs", 2, "--num_eval_episodes", 2, "--exp-name", "x",
-             "--no-cuda")  # fmt: skip
+             "--eval_freq", 0, "--num_envs", 128, "--num_actors", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2,
+             "--exp-name", "x", "--no-cuda")  # fmt: skip
     process = run_script(*flags, cwd=tmp_path, env=NO_VULKAN)
     assert process.returncode == 0, process.stderr
     first, last = [row["return"] for row in read_metrics(tmp_path / "runs/x") if row["kind"] == "eval"]

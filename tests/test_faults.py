@@ -418,11 +418,6 @@ TINY = ("--num_envs", 4, "--num_actors", 2, "--num_eval_envs", 1, "--num_eval_ep
         "--total_timesteps", 10**6)  # fmt: skip
 
 
-def shared_files():
-    """Ignores semaphores: other tests create them at the same time."""
-    return {path for path in Path("/dev/shm").glob("*") if not path.name.startswith("sem.mp-")}
-
-
 @pytest.fixture
 def start(tmp_path):
     """A function that starts the script in its own process group and waits until it trains. The test fails if the
@@ -430,7 +425,6 @@ def start(tmp_path):
     started = []
 
     def run(*flags, wait_for_rows=2, **environment):
-        shared_memory = shared_files()
         process = subprocess.Popen(
             [sys.executable, str(ROOT / "ppo.py"), *map(str, flags)],
             cwd=tmp_path, env={**os.environ, **NO_VULKAN, "PYTHONPATH": str(tmp_path), **environment},
@@ -438,22 +432,25 @@ def start(tmp_path):
         )  # fmt: skip
         metrics = tmp_path / "runs/x/metrics.jsonl"
         before = len(metrics.read_text().splitlines()) if metrics.exists() else 0
+        deadline = time.monotonic() + 120
         while process.poll() is None and wait_for_rows:
+            assert time.monotonic() < deadline, "the script does not train"
             if metrics.exists() and len(metrics.read_text().splitlines()) >= before + wait_for_rows:
                 break
             time.sleep(0.05)
         children = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
-        started.append((process, children, shared_memory))
+        started.append((process, children))
         return process, [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
     yield run
-    for process, children, shared_memory in started:
+    for process, children in started:
         process.kill()
         _, alive = psutil.wait_procs(children, timeout=10)
         for child in alive:
             child.kill()
         assert not alive, f"left behind: {alive}"
-        assert shared_files() <= shared_memory
+        for pid in (process.pid, *(child.pid for child in children)):
+            assert not [*Path("/dev/shm").glob(f"torch_{pid}_*")]
 
 
 def test_signals_keep_what_was_learned(in_update, in_tmp, monkeypatch, capsys):
@@ -469,6 +466,18 @@ def test_signals_keep_what_was_learned(in_update, in_tmp, monkeypatch, capsys):
         assert f"stopped by {signum.name}" in errors and f"--resume runs/{signum.name}" in errors
         assert ppo.load_checkpoint(f"runs/{signum.name}/last.pt")["iteration"] == 2
     assert handlers == [signal.getsignal(s) for s in ppo.STOP_SIGNALS], "main restores them"
+
+
+def test_a_second_signal_does_not_spoil_the_checkpoint(in_update, in_tmp, monkeypatch):
+    """SLURM sends two, and so do impatient people: the second one comes while last.pt is written."""
+    monkeypatch.setattr(ppo, "make_envs", batched_env.make_envs)
+    close = ppo.Checkpoints.close
+    monkeypatch.setattr(ppo.Checkpoints, "close", lambda self: (os.kill(os.getpid(), signal.SIGTERM), close(self)))
+    in_update(2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
+    flags += "--no-cuda --no-capture_video --eval_freq 0 --exp_name x"
+    assert ppo.main(flags.split()) == 143
+    assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 2
 
 
 @pytest.mark.slow
@@ -494,7 +503,7 @@ def test_control_c_in_a_terminal(start, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_signal_does_not_wait(start, tmp_path):
     """It ends a run whose actors are in the middle of a long rollout."""
-    process, _ = start(*TINY, "--num_steps", 10**5, "--total_timesteps", 10**7, wait_for_rows=1)
+    process, _ = start(*TINY, "--num_steps", 50_000, "--total_timesteps", 10**7, wait_for_rows=1)
     time.sleep(2)
     process.send_signal(signal.SIGTERM)
     begun = time.monotonic()
@@ -621,7 +630,7 @@ def test_shared_memory_that_is_too_small_is_refused(train, in_tmp, monkeypatch, 
     monkeypatch.setattr(shutil, "disk_usage", tiny)
     line = refused(TINY, capsys)
     assert re.search(r"needs \d+ MiB, and 0 MiB of shared memory", line) and asked == ["/dev/shm"]
-    assert all(remedy in line for remedy in ("--shm-size", "fewer --num_envs", "--num_actors 1"))
+    assert all(remedy in line for remedy in ("--shm-size", "try --num_steps", "--num_actors 1"))
     assert not multiprocessing.active_children(), "the other actor must have ended"
     train()
 

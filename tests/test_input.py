@@ -195,6 +195,7 @@ def test_driver_too_old(in_tmp, capsys, monkeypatch):
     monkeypatch.setattr(torch, "zeros", zeros)
     assert "driver on your system is too old" in refused(["--sim_backend", "physx_cuda"], capsys)
 
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     exists = Path.exists
     monkeypatch.setattr(Path, "exists", lambda path: path == Path("/proc/driver/nvidia") or exists(path))
     args = ppo.parse_args([])

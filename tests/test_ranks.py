@@ -68,10 +68,11 @@ def test_two_processes_train_together(tmp_path, monkeypatch, capsys):
             for key, value in expected.items():
                 torch.testing.assert_close(step[key], value, rtol=1e-4, atol=1e-5)
 
-    # both processes end with the same weights, although their episodes differ
+    # both processes end with the same weights, although their training episodes differ
     ranks = [torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1)]
     assert all(torch.equal(ranks[0]["agent"][k], ranks[1]["agent"][k]) for k in ranks[0]["agent"])
     assert not torch.equal(ranks[0]["actions"], ranks[1]["actions"])
+    assert not {*ranks[0]["seeds"]} & {*ranks[1]["seeds"]}
 
     # only the first process writes the run folder
     assert sorted(path.name.split(".out")[0] for path in (tmp_path / "runs/x").iterdir()) == [
@@ -101,8 +102,9 @@ def last_step(folder):
 
 @pytest.mark.slow
 def test_stopped_resumed_and_killed(tmp_path):
-    folder = tmp_path / "runs/x"
-    process = launch(tmp_path, "--total_timesteps", 10**7, "--exp-name", "x", *FLAGS)
+    """Both processes stop an update at the same epoch (--target_kl): else they would wait for each other."""
+    folder, target_kl = tmp_path / "runs/x", ("--desired_kl", "None", "--target_kl", 0.003)
+    process = launch(tmp_path, "--total_timesteps", 10**7, "--exp-name", "x", *target_kl, *FLAGS)
     wait_for(lambda: last_step(folder) > 1000 or process.poll() is not None)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=60)
@@ -127,16 +129,18 @@ if __name__ == "__main__":  # torchrun runs this in each process
     import batched_env
 
     Path(f"pid{ppo.RANK}").write_text(str(os.getpid()))
-    agents, make_agent, actions = [], ppo.Agent, []
+    agents, make_agent, actions, seeds = [], ppo.Agent, [], []
 
     def kept_agent(*arguments):
         agents.append(make_agent(*arguments))
         return agents[-1]
 
-    def envs_that_record(*arguments, **kwargs):
-        envs = batched_env.make_envs(*arguments, **kwargs)
-        step = envs.step
-        envs.step = lambda action: actions.append(action) or step(action)
+    def envs_that_record(*arguments, evaluation=False, **kwargs):
+        envs = batched_env.make_envs(*arguments, evaluation=evaluation, **kwargs)
+        step, reset = envs.step, envs.reset
+        if not evaluation:
+            envs.step = lambda action: actions.append(action) or step(action)
+            envs.reset = lambda seed=None, **options: seeds.extend(seed or []) or reset(seed=seed, **options)
         return envs
 
     ppo.Agent, ppo.make_envs = kept_agent, envs_that_record
@@ -147,4 +151,4 @@ if __name__ == "__main__":  # torchrun runs this in each process
     ppo.Agent = make_agent
     for script in (ppo, ppo_rgb):
         torch.save(one_step(script, 40, ppo.RANK, 2), f"{script.__name__}{ppo.RANK}.pt")
-    torch.save({"agent": agents[0].state_dict(), "actions": actions[-1]}, f"rank{ppo.RANK}.pt")
+    torch.save({"agent": agents[0].state_dict(), "actions": actions[-1], "seeds": seeds}, f"rank{ppo.RANK}.pt")

@@ -10,7 +10,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import NO_VULKAN, ROOT, Stop, crash, on_cpu_and_cuda, read_metrics, refused, run_script, same_run
+from conftest import (
+    NO_VULKAN,
+    ROOT,
+    Stop,
+    crash,
+    on_cpu_and_cuda,
+    read_metrics,
+    refused,
+    run_script,
+    same_run,
+    same_weights,
+)
 
 import ppo_rgb
 
@@ -308,6 +319,33 @@ def test_all_options_train(train):
         metrics, checkpoint = train(total_timesteps=320, **flags)
         assert [row["global_step"] for row in metrics if row["kind"] == "eval"] == [0, 320]
         assert all(torch.isfinite(v).all() for v in checkpoint["agent"].values())
+
+
+def test_load_agent_for_images(train):
+    _, checkpoint = train(total_timesteps=320, obs_mode="rgb+depth")
+    agent, args = ppo_rgb.load_agent("runs/run1/last.pt")
+    obs, _ = batched_env.make_envs(args, 2, 0, evaluation=True).reset(seed=[0, 1])
+    assert agent.get_action(obs).shape == (2, 2)
+    assert same_weights({"agent": agent.state_dict()}, checkpoint)
+
+
+def test_a_wrapper_that_hides_new_observations_from_the_space_is_refused(train, monkeypatch):
+    """The storage has the dtypes of the space: colours between 0 and 1 would be stored as 0."""
+
+    def with_bright_images(*arguments, **kwargs):
+        envs = batched_env.make_envs(*arguments, **kwargs)
+        reset = envs.reset
+
+        def reset_with_floats(**options):
+            obs, info = reset(**options)
+            return obs | {"rgb": obs["rgb"] / 255}, info
+
+        envs.reset = reset_with_floats
+        return envs
+
+    monkeypatch.setattr(ppo_rgb, "make_envs", with_bright_images)
+    with pytest.raises(ppo_rgb.RunError, match=r"torch.float32 .* uint8 .* must call update_obs_space"):
+        train(total_timesteps=320)
 
 
 @pytest.mark.slow

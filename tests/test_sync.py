@@ -13,8 +13,8 @@ import ppo_rgb
 # what differs above the banner; everything else that both have there must be equal
 DIFFERENT = {"Args", "Agent", "check_observations", "make_env", "rollout", "update_minibatch"}
 DIFFERENT_CONSTANTS = {"CPU_DEFAULTS", "GPU_BATCH_SIZE", "NUM_ITERATIONS", "FIXED_FLAGS", "LIMITS"}
-DIFFERENT_CONSTANTS |= {"UPDATE_THREADS_PER_CORE", "MIN_CPU_ENVS"}
-DIFFERENT_HELP = {"obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs"}
+DIFFERENT_CONSTANTS |= {"UPDATE_THREADS_PER_CORE", "MIN_CPU_ENVS", "(CPU_ENVS_PER_CORE, MAX_CPU_ENVS)"}
+DIFFERENT_HELP = {"obs_mode", "render_backend", "render_mode", "shader", "env_kwargs", "norm_obs", "total_timesteps"}
 
 
 def source(name):

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 from batched_env import BatchedReach
-from conftest import ACTIONS, SMALL, box, on_cpu_and_cuda, read_metrics, same_weights
-from test_rollout import gae_of_episodes
+from conftest import ACTIONS, SMALL, box, on_cpu_and_cuda, on_gpus, read_metrics, same_weights
+from test_gae import brute_force
 
 import ppo
 
@@ -116,11 +116,12 @@ def run(in_tmp, monkeypatch):
 def flat_batch(args, storage):
     """Returns the arrays to learn from, with one row for each (step, environment), in this order. Advantages follow
     their definition."""
-    columns = {k: v.double().numpy() for k, v in storage.items()}
-    advantages = gae_of_episodes(columns, args.gamma, args.gae_lambda, args.finite_horizon_gae)
+    columns = {k: v.double() for k, v in storage.items()}
+    rollout = [columns[k] for k in ("rewards", "values", "next_values", "dones")]
+    advantages = brute_force(*rollout, args.gamma, args.gae_lambda, args.finite_horizon_gae)
     columns |= dict(advantages=advantages, returns=advantages + columns["values"])
     names = ("obs", "actions", "logprobs", "advantages", "returns", "values")
-    return [columns[k].reshape(NUM_ENVS * NUM_STEPS, -1) for k in names]
+    return [columns[k].reshape(NUM_ENVS * NUM_STEPS, -1).numpy() for k in names]
 
 
 @pytest.mark.parametrize("finite_horizon", [False, True])
@@ -352,7 +353,9 @@ def test_without_success_the_return_decides(run):
 @pytest.mark.parametrize("rate, last", [(0.5, 2), (1.0, 3), (None, 4)])
 def test_stop_at_success(run, rate, last):
     record = run(scripted(*[(x, NONE, NONE) for x in (NONE, NONE, HALF, ALL, NONE)]), stop_at_success=rate)
-    assert record.checkpoint("last.pt")["iteration"] == last and len(record.iterations) == last
+    checkpoint = record.checkpoint("last.pt")
+    assert checkpoint["iteration"] == last and len(record.iterations) == last
+    assert checkpoint["finished"] == (last == ITERATIONS), "a run that stopped earlier can go on"
     assert len(record.eval_rows) == last + 1
 
 
@@ -458,8 +461,8 @@ def test_a_real_task(in_tmp):
     assert seeds[18:] in ([], second_look), "the last policy is looked at again if it may be the best"
 
 
-@pytest.mark.gpu
-def test_cpu_simulation_feeds_a_gpu_learner(in_tmp, monkeypatch):
+@on_gpus
+def test_cpu_simulation_feeds_a_gpu_learner(in_tmp, monkeypatch, device):
     """A copy of the agent on the CPU acts. The first rollout equals that of a CPU learner, and the second uses the
     weights that the GPU has learned."""
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))

@@ -1,5 +1,7 @@
 """The gradient step follows PPO's loss and Adam's rule, computed independently in float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -95,7 +97,7 @@ def test_one_step(flags):
     # Adam's first step: the bias-corrected moments are g and g^2
     wanted = [p.detach() - 1e-2 * g * scale / ((g * scale).abs() + 1e-5) for p, g in zip(parameters, gradients)]
 
-    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-2, eps=1e-5)
+    optimizer = ppo.make_optimizer(agent, replace(args, logstd_lr_factor=1.0), torch.device("cpu"))
     metrics = ppo.update_minibatch(agent, optimizer, args, **batch)
 
     for p, w in zip(parameters, wanted):

@@ -24,7 +24,8 @@ def steps_per_second(ranks, options):
     """Train; returns the median steps per second of whole iterations, of their rollouts and of their updates. The first
     two iterations warm up and do not count."""
     with tempfile.TemporaryDirectory() as folder:
-        steps = next((int(a) for f, a in zip(options.flags, options.flags[1:]) if f == "--num_steps"), 50)
+        flags = " ".join(options.flags).replace("=", " ").split()
+        steps = next((int(a) for f, a in zip(flags, flags[1:]) if f == "--num_steps"), 50)
         batch = options.num_envs * steps * ranks
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", ranks, SCRIPT,
                    "--num_envs", options.num_envs * ranks, "--num_steps", steps, "--exp_name", "x",

@@ -124,7 +124,7 @@ def train(command: list[str], recipe: str, seed: int, flags: list[str], num_at_o
     if not recipe.endswith("_sb3"):
         own.append("--no-capture_video")
         if num_at_once > 1:
-            own += ["--num_actors", str(max(1, os.cpu_count() // num_at_once))]
+            own += ["--num_actors", str(max(1, ppo.num_cores() // num_at_once))]
     if (run_dir / "last.pt").exists():
         run_script("python", script, "--resume", str(run_dir))
     elif not (run_dir / "best.json").exists():  # of sb3.py, which cannot resume
@@ -145,7 +145,7 @@ def evaluate(run_dir: Path, script: str, checkpoint: str) -> dict:
 
 def measure_physics(run_dir: Path, num_at_once: int) -> int:
     """Steps per second of physics alone, now, in as many processes as the run had."""
-    num_processes = max(1, os.cpu_count() // num_at_once)
+    num_processes = max(1, ppo.num_cores() // num_at_once)
     command = ("python", str(FOLDER / "rollout.py"), "--physics_alone", str(num_processes))
     return int(run_script(*command, "--checkpoint", str(run_dir / "best.pt")))
 

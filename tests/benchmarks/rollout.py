@@ -61,8 +61,9 @@ def rollout_phase(script, checkpoint, iterations):
         command = [sys.executable, str(script), *flags.split(), "--checkpoint", str(checkpoint)]
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
         rows = [json.loads(line) for line in (Path(folder) / "runs/x/metrics.jsonl").read_text().splitlines()]
-    rates = [batch_size / row["rollout_time"] for row in rows if row["kind"] == "train"]
-    return statistics.median(rates[2:])
+    rows = [row for row in rows if row["kind"] == "train"]
+    steps = rows[0]["global_step"]  # of an iteration of that script
+    return statistics.median([steps / row["rollout_time"] for row in rows[2:]])
 
 
 class Recorder:

@@ -4,7 +4,8 @@ hyperparameters and VecNormalize. It trains in 8 environments of ppo.py's batch,
     uv run --group benchmark tests/benchmarks/sb3.py --env_id PushCube-v1 --total_timesteps 120000 --seed 4 --exp_name x
 
 Writes runs/<exp_name>/: metrics.jsonl and args.json like ppo.py, and best.json and last.json, the results of --episodes
-unseen episodes of the best policy (by the success rates of an evaluation, as ppo.py's best.pt) and of the last one.
+unseen episodes of the best policy and of the last one. Success rates of one evaluation choose the best; ppo.py checks
+them with as many other episodes.
 """
 
 import argparse

@@ -3,21 +3,24 @@
 python tests/benchmarks/starts.py examples.push_to_goal:PushToGoal-v1 push_to_goal.png
 """
 
+import argparse
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-import ppo  # before mani_skill: ppo lets it use a software renderer
+import ppo  # noqa: F401  # before mani_skill: it lets that use a software renderer
 
 # isort: split
 import gymnasium as gym
 import imageio.v3 as iio
 import torch
 
-env_id, path = sys.argv[1:]
-args = ppo.Args(env_id=env_id, sim_backend="physx_cpu", render_backend="cpu")
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("env_id")
+parser.add_argument("path", help="where the picture goes")
+options = parser.parse_args()
 env = gym.make(
-    env_id, render_mode="rgb_array", render_backend=args.render_backend, sim_backend="physx_cpu",
+    options.env_id, render_mode="rgb_array", render_backend="cpu", sim_backend="physx_cpu",
     human_render_camera_configs=dict(width=192, height=192),
 )  # fmt: skip
 frames = []
@@ -25,4 +28,4 @@ for seed in range(16):
     env.reset(seed=seed, options=dict(reconfigure=True))
     frames.append(env.render()[0].cpu())
 rows = [torch.cat(frames[i : i + 8], dim=1) for i in (0, 8)]
-iio.imwrite(path, torch.cat(rows).numpy())
+iio.imwrite(options.path, torch.cat(rows).numpy())

@@ -24,7 +24,7 @@ class Frames(list):
 def film(run: Path, seed: int) -> tuple[str, list]:
     """The name of the task, and the frames of an episode."""
     agent, args = ppo.load_agent(run / "best.pt")
-    args.render_backend, args.sim_backend = "gpu", "physx_cpu"
+    args.render_backend, args.sim_backend, args.capture_video = "gpu", "physx_cpu", True
     with contextlib.ExitStack() as closing:
         ppo.Film(args, run, closing)  # makes the renderer
         envs = ppo.make_envs(args, 1, seed, evaluation=True, film=True)

@@ -29,15 +29,20 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo
 
-BATCH, MINIBATCHES, EPOCHS = ppo.parse_args(["--no-cuda"]).batch_size, 4, 8
+MINIBATCHES, EPOCHS = 4, 8
 SCRIPT = Path(ppo.__file__)
+
+
+def batch_size():
+    """Steps of an iteration: the default of ppo.py with these cores."""
+    return ppo.parse_args(["--no-cuda"]).batch_size
 
 
 def ours(iterations):
     """Run ppo.py as a command; returns the steps per second of each iteration after the first."""
     flags = (f"--no-cuda --num_minibatches {MINIBATCHES} --target_kl None --desired_kl None --no-anneal_lr "
-             f"--update_epochs {EPOCHS} --total_timesteps {BATCH * iterations} --eval_freq 0 --num_eval_episodes 2 "
-             "--num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
+             f"--update_epochs {EPOCHS} --total_timesteps {batch_size() * iterations} --eval_freq 0 "
+             "--num_eval_episodes 2 --num_eval_envs 2 --no-capture_video --exp_name x")  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(SCRIPT), *flags.split()]
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
@@ -81,15 +86,16 @@ def stable_baselines3(iterations):
             self.starts.append(time.perf_counter())
 
     torch.set_num_threads(ppo.num_cores())
+    batch = batch_size()
     envs = SubprocVecEnv([sb3_env] * 8, start_method="spawn")
     network = dict(pi=[256] * 3, vf=[256] * 3)
-    model = PPO("MlpPolicy", envs, n_steps=BATCH // 8, batch_size=BATCH // MINIBATCHES, n_epochs=EPOCHS, gamma=0.8,
+    model = PPO("MlpPolicy", envs, n_steps=batch // 8, batch_size=batch // MINIBATCHES, n_epochs=EPOCHS, gamma=0.8,
                 gae_lambda=0.9, learning_rate=3e-4, max_grad_norm=0.5, device="cpu", seed=1,
                 policy_kwargs=dict(net_arch=network, activation_fn=torch.nn.Tanh))  # fmt: skip
     timer = Timer()
-    model.learn(BATCH * (iterations + 1), callback=timer)
+    model.learn(batch * (iterations + 1), callback=timer)
     envs.close()
-    return [BATCH / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
+    return [batch / (b - a) for a, b in zip(timer.starts, timer.starts[1:])][1:]
 
 
 CANDIDATES = {"ppo.py": ours, "SB3": stable_baselines3, "ppo.py, loaded": ours_next_to_other_work}
