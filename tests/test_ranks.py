@@ -103,7 +103,7 @@ def last_step(folder):
 @pytest.mark.slow
 def test_stopped_resumed_and_killed(tmp_path):
     """Both processes stop an update at the same epoch (--target_kl): else they would wait for each other."""
-    folder, target_kl = tmp_path / "runs/x", ("--desired_kl", "None", "--target_kl", 0.003)
+    folder, target_kl = tmp_path / "runs/x", ("--desired_kl", "None", "--learning_rate", 1e-4, "--target_kl", 0.003)
     process = launch(tmp_path, "--total_timesteps", 10**7, "--exp-name", "x", *target_kl, *FLAGS)
     wait_for(lambda: last_step(folder) > 1000 or process.poll() is not None)
     process.send_signal(signal.SIGTERM)
