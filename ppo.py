@@ -33,6 +33,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
+import io
 import json
 import math
 import os
@@ -105,7 +106,6 @@ import mani_skill.envs.sapien_env as sapien_env
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.render.utils import can_render
 from mani_skill.utils import common, download_asset
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
@@ -121,7 +121,7 @@ gc.freeze()  # ManiSkill collects garbage whenever it builds scenes: exempt what
 
 RANK, LOCAL_RANK = int(os.environ.get("RANK", 0)), int(os.environ.get("LOCAL_RANK", 0))  # set by torchrun
 WORLD_SIZE, LOCAL_WORLD_SIZE = (int(os.environ.get(k, 1)) for k in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
-STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # USR1: SLURM's warning
+STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGUSR1", signal.SIGTERM)}  # SLURM may send USR1
 # how the file names of installed packages begin
 PACKAGES = ("<frozen", *(str(Path(x).parent) for x in (os.__file__, Path(gym.__file__).parent, mani_skill.__file__)))
 SCRIPT = Path(__file__)
@@ -272,7 +272,8 @@ class Args:
     save_train_video_freq: Optional[int] = None
     """film the policy as it explores, every so many iterations"""
     save_trajectory: bool = False
-    """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor"""
+    """write evaluation episodes as ManiSkill trajectories next to the videos, one file an actor (of torchrun's first
+    process)"""
 
     @property
     def batch_size(self) -> int:
@@ -637,7 +638,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
             if local.capture_video:
                 film.record(actors.agent, f"videos/step_{global_step:09d}", args.eval_seed)
             is_solved = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
-            if is_last or is_solved:
+            if is_last or is_solved and iteration > first_iteration:  # a run that was solved can be resumed
                 checkpoints.contents["finished"] = is_last
                 break
 
@@ -688,6 +689,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
         )  # fmt: skip
         logger.log("train", global_step, metrics)
         if local.save_train_video_freq and iteration % local.save_train_video_freq == 0:
+            actors.agent.load_state_dict(agent.state_dict())  # it may be a copy on another device
             film.record(actors.agent, f"train_videos/step_{global_step:09d}", args.eval_seed, exploring=True)
 
 
@@ -696,9 +698,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
 
 # ----- Evaluation -----------------------------------------------------------------------------------------------------
 @torch.no_grad()
-def evaluate(
-    agent, envs, args: Args, num_episodes: int, seed: int, separately: bool = False, exploring: bool = False, video=None
-) -> dict[str, torch.Tensor]:
+def evaluate(agent, envs, args: Args, num_episodes, seed, separately=False, exploring=False, video=None) -> dict:
     """Run whole episodes; episode k starts from seed + k. Actions are deterministic, unless `exploring`. `separately`:
     see start_episodes. `video`: an imageio writer that gets a picture of each step.
 
@@ -716,10 +716,7 @@ def evaluate(
         running = torch.ones(envs.num_envs, dtype=torch.bool, device=envs.device)
         episodes = {}
         for step in range(1, num_steps + 1):
-            if exploring:
-                action = agent.clip_action(agent.get_action_and_value(obs)[0])
-            else:
-                action = agent.get_action(obs)
+            action = agent.clip_action(agent.get_action_and_value(obs)[0]) if exploring else agent.get_action(obs)
             obs, _, terminated, truncated, infos = envs.step(action)
             add_picture(video, envs)
             ended = running & (terminated | truncated | (step == num_steps))
@@ -870,7 +867,12 @@ def find_task(env_id: str):
 
 def varies_objects(env_id: str) -> bool:
     """Whether the task builds other objects for each episode. Such tasks take reconfiguration_freq as an argument."""
-    return "reconfiguration_freq" in inspect.signature(find_task(env_id).cls.__init__).parameters
+    for cls in find_task(env_id).cls.__mro__:
+        if cls is sapien_env.BaseEnv:  # it takes the argument for all tasks
+            return False
+        if "__init__" in vars(cls) and "reconfiguration_freq" in inspect.signature(cls.__init__).parameters:
+            return True
+    return False
 
 
 def make_task(env_id: str, **kwargs) -> gym.Env:
@@ -884,9 +886,7 @@ def make_task(env_id: str, **kwargs) -> gym.Env:
         raise RunError(f"{env_id}: {describe(cause)}") from None
 
 
-def make_envs(
-    args: Args, num_envs: int, seed: int, evaluation: bool = False, film: bool = False, record: Optional[dict] = None
-) -> ManiSkillVectorEnv:
+def make_envs(args: Args, num_envs: int, seed: int, evaluation=False, film=False, record=None) -> ManiSkillVectorEnv:
     """Environments with ManiSkill's interface for a batch. Those for evaluation do not reset by themselves. If the task
     varies its objects, they follow from the seed. `record`: arguments of RecordEpisode, which writes trajectories."""
     sapien_env.BaseEnv.build_seed = seed
@@ -937,7 +937,7 @@ def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
     reset_error = find_reset_error(envs)
     if args.partial_reset and reset_error and {"success", "fail"} & info.keys():
         fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
-             f"resets all; --sim_backend physx_cpu --num_actors {args.num_envs} gives each a process")  # fmt: skip
+             "resets all; --sim_backend physx_cpu --num_actors N --num_envs N gives each a process")  # fmt: skip
     limit = find_max_episode_steps_value(envs)
     if limit and args.gamma < 1 and not limit / 25 <= 1 / (1 - args.gamma) <= 10 * limit:
         ahead, better = 1 / (1 - args.gamma), 1 - 10 / max(limit, 20)
@@ -1018,11 +1018,11 @@ class BatchedPhysx:
 
     __class__ = physx.PhysxGpuSystem  # for isinstance
 
-    def __init__(self, scenes: list[sapien.Scene], timestep: float):
-        self.scenes, self.systems, self.timestep = scenes, [scene.physx_system for scene in scenes], timestep
-        self.num_steps = 0
+    def __init__(self, scenes: list[sapien.Scene]):
+        self.scenes, self.systems = scenes, [scene.physx_system for scene in scenes]
+        self.timestep, self.num_steps = self.systems[0].timestep, 0
         for scene in scenes:
-            scene.batch, scene.physx_system.timestep = self, timestep
+            scene.batch = self
 
     def gpu_init(self) -> None:
         self.free = [body for system in self.systems for body in system.rigid_dynamic_components]
@@ -1043,21 +1043,18 @@ class BatchedPhysx:
 
         # Where the numbers are in the bytes of pack(): for each free body, then for each articulation, quaternion (w
         # first), position, linear and angular velocity; for articulations then each joint's position and velocity.
-        free_at, roots_at, end = [], [], 0
+        starts, end = {}, 0
         for system in self.systems:
-            for _ in system.rigid_dynamic_components:
-                free_at.append(end)
-                end += 13
-            for link in system.articulation_link_components:
-                if link.is_root:
-                    roots_at.append(end)
-                    end += 13 + 4 * link.articulation.dof
+            robots = [link.articulation for link in system.articulation_link_components if link.is_root]
+            for x in system.rigid_dynamic_components + robots:
+                starts[x] = end
+                end += 13 + 4 * getattr(x, "dof", 0)
         order = torch.tensor([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-        self.free_columns = torch.tensor(free_at, dtype=torch.long)[:, None] + order
-        self.root_columns = torch.tensor(roots_at, dtype=torch.long)[:, None] + order[7:]
+        self.free_columns = torch.tensor([starts[x] for x in self.free], dtype=torch.long)[:, None] + order
+        self.root_columns = torch.tensor([starts[x] for x in self.robots], dtype=torch.long)[:, None] + order[7:]
         self.joint_columns = torch.full((2, num_robots, max_dof), end)  # padding reads a zero at the end
         for i, robot in enumerate(self.robots):
-            columns = roots_at[i] + 13 + torch.arange(2 * robot.dof)
+            columns = starts[robot] + 13 + torch.arange(2 * robot.dof)
             self.joint_columns[:, i, : robot.dof] = columns.view(2, robot.dof)
         self.gpu_fetch_rigid_dynamic_data()
         self.gpu_fetch_articulation_link_pose()
@@ -1194,9 +1191,6 @@ class BatchedPhysx:
     gpu_create_contact_pair_impulse_query = gpu_create_contact_body_impulse_query
     gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
 
-    def get_scene_offset(self, scene) -> list[float]:
-        return [0.0, 0.0, 0.0]  # each scene is a world of its own
-
     _nothing = lambda self: None  # for what a CPU simulation need not do
     gpu_fetch_articulation_target_qpos = gpu_fetch_articulation_target_qvel = _nothing
     gpu_update_articulation_kinematics = sync_poses_gpu_to_cpu = _nothing
@@ -1244,17 +1238,15 @@ def batch_on_cpu() -> None:
     build_physx_component = ActorBuilder.build_physx_component
 
     def setup_batch(env):
+        setup_scene(env)
+        scenes = env.scene.sub_scenes
         if env.num_envs == 1 or env._sim_device.is_cuda():
-            return setup_scene(env)
-        env._set_scene_config()
-        scenes = []
-        for _ in range(env.num_envs):
-            systems = [physx.PhysxCpuSystem()]
-            if can_render(env._render_device):
-                systems.append(sapien.render.RenderSystem(env._render_device))
-            scenes.append(sapien.Scene(systems))
+            return
+        while len(scenes) < env.num_envs:  # ManiSkill's simulation on a CPU has one
+            setup_scene(env)
+            scenes = scenes + env.scene.sub_scenes
         env.scene = ManiSkillScene(scenes, sim_config=env.sim_config, device=env.device, backend=env.backend)
-        env.scene.px, env.scene.gpu_sim_enabled = BatchedPhysx(scenes, 1 / env._sim_freq), True
+        env.scene.px, env.scene.gpu_sim_enabled = BatchedPhysx(scenes), True
         env.scene.render_system_group = BatchedRenderer(scenes)
 
     def reset_from_own_seeds(env, seed=None, options=None):
@@ -1283,19 +1275,14 @@ def find_rows() -> None:
             struct.px.read_velocities(struct._objs)
         return body_data.fget(struct)
 
-    def patch(cls, name, get_entity):
-        index = getattr(cls, name)
+    def find_row(index, component):
+        scene = getattr(component, "root", component).entity.scene  # an articulation is where its root is
+        return scene.batch.row[component] if hasattr(scene, "batch") else index.fget(component)
 
-        def find_row(component):
-            batch = getattr(get_entity(component).scene, "batch", None)
-            return batch.row[component] if batch else index.fget(component)
-
-        setattr(cls, name, property(find_row))
-
-    patch(physx.PhysxRigidDynamicComponent, "gpu_pose_index", lambda body: body.entity)
-    patch(physx.PhysxArticulationLinkComponent, "gpu_pose_index", lambda link: link.entity)
-    patch(physx.PhysxArticulation, "gpu_index", lambda robot: robot.root.entity)
     PhysxRigidBodyComponentStruct._body_data = property(body_data_with_velocities)
+    physx.PhysxArticulation.gpu_index = property(partial(find_row, physx.PhysxArticulation.gpu_index))
+    for cls in (physx.PhysxRigidDynamicComponent, physx.PhysxArticulationLinkComponent):
+        cls.gpu_pose_index = property(partial(find_row, cls.gpu_pose_index))
 
 
 def solve_inverse_kinematics_of_batches() -> None:
@@ -1325,13 +1312,12 @@ solve_inverse_kinematics_of_batches()
 
 
 # ----- Actors: processes that simulate on a CPU -----------------------------------------------------------------------
-def raise_file_limit() -> None:
-    """Allow this process as many open files as the system lets it have."""
-    with contextlib.suppress(ImportError, ValueError, OSError):  # Windows has none, and macOS refuses its own limit
-        import resource
-
-        _, highest = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (highest, highest))
+def num_scenes(args: Args) -> int:
+    """Number of environments that all actors build together."""
+    num_eval_envs = args.num_eval_envs
+    if args.num_eval_steps is None:
+        num_eval_envs = min(num_eval_envs, args.num_eval_episodes)
+    return num_eval_envs if args.evaluate else args.num_envs + num_eval_envs
 
 
 def even_share(total: int, index: int, shares: int) -> range:
@@ -1359,9 +1345,7 @@ class Actor:
         record = dict(output_dir=str(folder), trajectory_name=f"trajectory_{index}") if args.save_trajectory else None
         seed = args.eval_seed + RANK * args.num_eval_episodes + eval_episodes.start
         self.eval_envs = make_envs(args, max(1, num_eval_envs), seed, evaluation=True, record=record)
-        base_env = self.eval_envs.base_env
-        batched = isinstance(base_env, sapien_env.BaseEnv) and is_batch(base_env.scene)
-        self.separately = batched and find_reset_error(self.eval_envs) is None
+        self.separately = is_batch(self.eval_envs.base_env.scene) and find_reset_error(self.eval_envs) is None
 
     def receive(self, agent, storage: dict) -> None:
         """Take the agent, and the storage to write into: this actor's columns."""
@@ -1432,7 +1416,9 @@ class Actors:
     """Actor 0 in this process and, with CPU simulation, each further one in a process of its own."""
 
     def __init__(self, args: Args, trajectory_dir: Path, closing: contextlib.ExitStack):
-        raise_file_limit()  # torch sends each actor its tensors as open files
+        if hasattr(psutil, "RLIMIT_NOFILE"):  # Linux: torch sends each actor its tensors as open files
+            _, highest = psutil.Process().rlimit(psutil.RLIMIT_NOFILE)
+            psutil.Process().rlimit(psutil.RLIMIT_NOFILE, (highest, highest))
         # Processes inherit this: they ignore these signals, and the main process ends them.
         handlers = set_handlers(dict.fromkeys(STOP_SIGNALS, signal.SIG_IGN))
         self.pools = [ProcessPoolExecutor(1, mp.get_context("spawn")) for _ in range(1, args.num_actors)]
@@ -1481,9 +1467,9 @@ class Actors:
         sums_of_actors = self.call("rollout", iteration, is_first)
         floats = [x for x in tree_leaves(self.storage) if x.is_floating_point()]
         is_broken = torch.stack([~x.isfinite().reshape(*x.shape[:2], -1).all(2).all(0) for x in floats]).any(0)
-        if any(all_gather(is_broken.any().item())):  # all processes stop together
-            broken = ", ".join(map(str, all_gather(is_broken.nonzero().flatten().tolist())))  # a list of each process
-            raise RunError(f"the rollout has NaN or infinity in environments {broken}")
+        broken = all_gather([i for i, x in enumerate(is_broken.tolist()) if x])  # a list of each process
+        if any(broken):  # all processes stop together
+            raise RunError(f"the rollout has NaN or infinity in environments {', '.join(map(str, broken))}")
         if self.learner_storage is not self.storage:
             tree_map(lambda new, old: new.copy_(old), self.learner_storage, self.storage)
         return sums_of_actors
@@ -1539,17 +1525,13 @@ def make_storage(agent, obs_space, action_space, args: Args, device: torch.devic
 
 def layers_size(agent, storage: dict) -> float:
     """Bytes that the layers of the network keep for the gradient of one observation, measured with two."""
-    agent, sizes = copy.deepcopy(agent).cpu(), {}
-    weights = [x.untyped_storage().data_ptr() for x in agent.parameters()]
+    agent, kept = copy.deepcopy(agent).cpu(), []
     rows = [tree_map(lambda x: torch.zeros(2, *x.shape[2:], dtype=x.dtype), storage[k]) for k in ("obs", "actions")]
-
-    def keep(x):
-        sizes[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
-        return x
-
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda x: x):
+    with torch.autograd.graph.saved_tensors_hooks(kept.append, lambda x: x):  # no gradient is computed
         agent.get_action_and_value(*rows)
-    return sum(size for address, size in sizes.items() if address not in weights) / 2
+    weights = {x.untyped_storage() for x in agent.parameters()}
+    storages = {x.untyped_storage() for x in kept}
+    return sum(x.nbytes() for x in storages if x not in weights) / 2
 
 
 # ----- Checkpoints ----------------------------------------------------------------------------------------------------
@@ -1570,7 +1552,8 @@ def make_agent(obs_space, action_space, args: Args, checkpoint: dict) -> Agent:
     agent = Agent(obs_space, action_space, args)
     if checkpoint:
         try:
-            agent.load_state_dict(checkpoint["agent"])
+            bounds = dict(action_low=agent.action_low, action_high=agent.action_high)  # perhaps of another controller
+            agent.load_state_dict(checkpoint["agent"] | bounds)
         except RuntimeError as error:
             fail(f"{checkpoint['path']} is of another network or task: {error}")
     agent.load_state_dict(all_gather(agent.state_dict())[0])  # machines may turn a seed into different weights
@@ -1605,9 +1588,8 @@ class Checkpoints:
 
     def take(self, iteration: int, global_step: int) -> None:
         """Copy the state from which a resumed run goes on, and write it if that is due."""
-        state = {name: x.state_dict() for name, x in self.saved.items()}
         copied = lambda x: x.to("cpu", copy=True, non_blocking=True) if isinstance(x, torch.Tensor) else x
-        state = tree_map(copied, state)
+        state = {name: tree_map(copied, x.state_dict()) for name, x in self.saved.items()}
         if self.saved["agent"].actor_logstd.is_cuda:
             torch.cuda.synchronize()  # the host waits once, not for each tensor
         progress = dict(iteration=iteration, global_step=global_step, finished=False, best_score=self.best_score)
@@ -1626,8 +1608,10 @@ class Checkpoints:
     def write(self, name: str) -> None:
         """Write another file, then rename it: at any moment there is the old checkpoint or the new one, whole."""
         if self.args.save_model and RANK == 0:
+            buffer = io.BytesIO()  # a signal while torch writes to a file may end the process
+            torch.save(self.contents, buffer)
             with open(self.run_dir / name.replace(".pt", ".tmp"), "wb") as file:
-                torch.save(self.contents, file)
+                file.write(buffer.getbuffer())
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(file.name, self.run_dir / name)
@@ -1668,7 +1652,8 @@ class Logger:
         path.touch()
         os.truncate(path, min(path.stat().st_size, resumed.get("metrics_size", 0)))  # later steps are done again
         self.file = open(path, "a")
-        self.wandb_id, global_step = self.wandb_run and self.wandb_run.id, resumed.get("global_step", 0)
+        self.wandb_id = self.wandb_run.id if self.wandb_run else resumed.get("wandb_id")
+        global_step = resumed.get("global_step", 0)
         self.writer = SummaryWriter(str(run_dir), purge_step=global_step + 1 if resumed else None)
         self.bar = tqdm(
             total=args.num_iterations * args.batch_size, initial=global_step, dynamic_ncols=True,
@@ -1731,8 +1716,7 @@ def average_episodes(sums_of_actors: list[dict]) -> dict:
     for sums in sum(all_gather(on_host), []):
         total.update(sums)
     num_episodes = int(total.pop("num_episodes"))
-    means = {key: x / num_episodes for key, x in total.items()} if num_episodes else {}
-    return means | dict(num_episodes=num_episodes)
+    return {key: x / num_episodes for key, x in total.items()} | dict(num_episodes=num_episodes)
 
 
 # ----- CUDA graphs, several processes ---------------------------------------------------------------------------------
@@ -1752,8 +1736,7 @@ class CudaGraph:
         self.num_calls += 1
         if self.num_calls == 1:
             self.obs, self.stream = copy.deepcopy(obs), torch.cuda.Stream()
-        for old, new in zip(tree_leaves(self.obs), tree_leaves(obs)):
-            old.copy_(new)
+        tree_map(lambda old, new: old.copy_(new), self.obs, obs)
         if self.num_calls <= 3:
             self.stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(self.stream):
@@ -1873,6 +1856,8 @@ def parse_args(argv: list[str]) -> Args:
         default = replace(default, **{k: run[k] for k in flags if k in run})
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
+    if given.resume is not None and args.sim_backend != run["sim_backend"]:
+        args.num_actors = given.num_actors
     if args.num_steps is None:
         batch_size = CPU_BATCH_SIZE if args.sim_backend == "physx_cpu" else GPU_BATCH_SIZE
         args.num_steps = max(5, batch_size // max(1, args.num_envs))
@@ -1881,7 +1866,7 @@ def parse_args(argv: list[str]) -> Args:
     if args.num_actors is None:
         args.num_actors = WORLD_SIZE
         if args.sim_backend == "physx_cpu":
-            needed = math.ceil((args.num_envs + args.num_eval_envs) / WORLD_SIZE / MAX_SCENES_OF_PROCESS)
+            needed = math.ceil(num_scenes(args) / WORLD_SIZE / MAX_SCENES_OF_PROCESS)
             args.num_actors = max(1, min(max(num_cores(), needed) * WORLD_SIZE, args.num_envs))
     if args.exp_name is None:
         args.exp_name = f"{args.env_id.split(':')[-1]}__{SCRIPT.stem}__{args.seed}__{int(time.time())}"
@@ -1957,15 +1942,9 @@ def check(args: Args) -> None:
         fail("--track needs Weights & Biases: pip install wandb")
     if WORLD_SIZE > 1 and args.evaluate:
         fail("--evaluate is for one process: leave out torchrun")
-    check_task_flags(args)
-    check_simulation(args)
-    check_observations(args)
     run_dir = find_run_dir(args)
     if not (args.resume or args.evaluate) and os.path.exists(run_dir / "metrics.jsonl"):
         fail(f"{run_dir} holds a run: continue it with --resume {run_dir}, or choose another --exp_name")
-
-
-def check_task_flags(args: Args) -> None:
     try:
         find_task(args.env_id)
     except KeyError:
@@ -1982,6 +1961,8 @@ def check_task_flags(args: Args) -> None:
     for k in env_kwargs:
         if hasattr(args, k):
             fail(f"--env_kwargs: {k} has its own flag: --{k}")
+    check_simulation(args)
+    check_observations(args)
 
 
 def check_simulation(args: Args) -> None:
@@ -1991,7 +1972,7 @@ def check_simulation(args: Args) -> None:
         fail(f"--no-cuda, and --sim_backend is {args.sim_backend}: give --sim_backend physx_cpu as well")
     if on_gpu and args.num_actors > WORLD_SIZE:
         fail(f"--num_actors {args.num_actors}: on a GPU one process simulates all environments")
-    if not on_gpu and args.num_envs + args.num_eval_envs > args.num_actors * MAX_SCENES_OF_PROCESS:
+    if not on_gpu and num_scenes(args) > args.num_actors * MAX_SCENES_OF_PROCESS:
         fail(f"--num_envs {args.num_envs}, --num_eval_envs {args.num_eval_envs}: on a CPU, one process simulates at "
              f"most {MAX_SCENES_OF_PROCESS} environments, and --num_actors is {args.num_actors}")  # fmt: skip
     if on_gpu and (args.shader or "").startswith("rt"):
@@ -2006,7 +1987,8 @@ def check_simulation(args: Args) -> None:
         try:
             torch.zeros(1, device=choose_device(local_args(args)) if on_gpu else f"cuda:{LOCAL_RANK}")
             if on_gpu:  # SAPIEN downloads PhysX's GPU library when it first needs it: one process at a time
-                with filelock.FileLock(Path.home() / ".sapien/physx.lock"):
+                lock = filelock.FileLock(Path.home() / ".sapien/physx.lock")
+                with lock if LOCAL_WORLD_SIZE > 1 else contextlib.nullcontext():
                     sapien.physx.enable_gpu()
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]

@@ -1,5 +1,7 @@
 """Small torch-native batched environments with the interface of a GPU-simulated ManiSkill task."""
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ class BatchedReach(gym.Env):
 
     reconfiguration_freq = 0
     max_episode_steps = 20
+    scene = SimpleNamespace(gpu_sim_enabled=False)
 
     def __init__(self, num_envs, device):
         self.num_envs, self.device, self.metadata = num_envs, torch.device(device), {}

@@ -89,8 +89,9 @@ def test_weights_and_biases(in_tmp, monkeypatch):
     flags += ("--wandb_group", "mine", "--env_kwargs", '{"max_episode_steps": 3}')
     assert ppo.main([*map(str, flags)]) == 0
     assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "60"]) == 0
+    assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "80", "--no-track"]) == 0
     monkeypatch.setattr(ppo, "rollout", crash)
-    assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "80"]) == 1
+    assert ppo.main(["--resume", "runs/tiny", "--total_timesteps", "100", "--track"]) == 1
     assert [init["id"] for init in wandb.inits] == [None, "the-run", "the-run"]
     assert wandb.exit_codes == [0, 0, 1]
     assert all(init["name"] == "tiny" and init["group"] == "mine" for init in wandb.inits)
@@ -172,6 +173,7 @@ def test_defaults_by_cores(monkeypatch, cores, num_envs, num_steps):
     args = ppo.parse_args(["--no-cuda", "--num_envs", "512", "--num_minibatches", "3"])
     assert args.num_envs == 512 and args.num_minibatches == 3 and args.num_iterations == 75 and args.num_steps == 5
     assert ppo.parse_args(["--no-cuda", "--num_envs", "1"]).num_actors == 1
+    ppo.check_simulation(ppo.parse_args(["--no-cuda", "--num_actors", "1"]))  # README's remedy for little shared memory
     assert ppo.parse_args(["--no-cuda", "--num_envs", "4096"]).num_actors == max(cores, 6), "800 in a process"
     assert ppo.parse_args(["--no-cuda", "--total_timesteps", "9999"]).total_timesteps == 9999
 
@@ -353,7 +355,9 @@ def test_task_that_cannot_reset_some_environments(in_tmp, monkeypatch, capsys):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     flags = (*TINY, "--num_envs", 2, "--num_eval_envs", 2, "--env_id", "whole:Whole-v1", "--no-capture_video")
     line = refused((*flags, "--num_actors", 1), capsys)
-    assert "Whole-v1 cannot reset some" in line and "--num_actors 2" in line and "--no-partial_reset" in line
+    assert (
+        "Whole-v1 cannot reset some" in line and "--num_actors N --num_envs N" in line and "--no-partial_reset" in line
+    )
     assert re.search(r"\(\w+Error: .* \(.*py, line \d+\)\)", line), "the reason, and where"
     for n, remedy in enumerate((("--num_actors", 2), ("--num_actors", 1, "--no-partial_reset"))):
         assert ppo.main([*map(str, (*flags, *remedy, "--exp-name", n))]) == 0

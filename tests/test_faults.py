@@ -22,6 +22,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import batched_env
+import gymnasium as gym
 import psutil
 import pytest
 import torch
@@ -124,6 +125,34 @@ def test_resume_continues_normalisation_optimizer_and_schedule(train, in_update,
 
 
 @on_cpu_and_cuda
+def test_a_solved_run_can_go_on(train):
+    """A resumed run does not end at once because of the success that it had."""
+    _, last = train(stop_at_success=0.0)
+    assert last["iteration"] == 2 and not last["finished"]
+    _, last = train(stop_at_success=0.0, resume="runs/run1")
+    assert last["iteration"] == 4 and last["finished"]
+
+
+def test_actions_keep_the_bounds_of_the_task(train):
+    """A policy that learned with one controller may go on with another one, which has other bounds."""
+    _, checkpoint = train(total_timesteps=320)
+    agent = ppo.make_agent(box(4), gym.spaces.Box(-3, 5, (2,)), SMALL, checkpoint)
+    assert (agent.action_low == -3).all() and (agent.action_high == 5).all()
+    assert all(torch.equal(x, checkpoint["agent"][k]) for k, x in agent.named_parameters())
+
+
+def test_a_run_of_a_gpu_goes_on_with_all_cores(train, monkeypatch):
+    """There, one process simulated all environments."""
+    train(total_timesteps=320)
+    checkpoint = torch.load("runs/run1/last.pt")
+    checkpoint["args"] |= dict(sim_backend="physx_cuda:0", num_actors=1)
+    torch.save(checkpoint, "runs/run1/last.pt")
+    monkeypatch.setattr(ppo, "num_cores", lambda: 16)
+    flags = ["--resume", "runs/run1", "--sim_backend", "physx_cpu", "--total_timesteps", "640"]
+    assert ppo.parse_args(flags).num_actors == 16
+    assert ppo.parse_args([*flags, "--num_actors", "3"]).num_actors == 3
+
+
 def test_a_finished_run_can_go_on(train, in_tmp):
     train(total_timesteps=320 * 2)
     metrics, last = train(total_timesteps=320 * 5, resume="runs/run1")
@@ -480,6 +509,28 @@ def test_a_second_signal_does_not_spoil_the_checkpoint(in_update, in_tmp, monkey
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 2
 
 
+def test_a_signal_while_a_checkpoint_is_written(tmp_path):
+    """It ends the run as at any other moment. torch's writer would make another error of it."""
+    checkpoints = object.__new__(ppo.Checkpoints)
+    checkpoints.args, checkpoints.run_dir = SimpleNamespace(save_model=True), tmp_path
+    checkpoints.contents = {"weights": [torch.rand(1000) for _ in range(3000)]}
+    begun = time.perf_counter()
+    checkpoints.write("last.pt")
+    seconds = time.perf_counter() - begun
+    handlers = ppo.set_handlers({signal.SIGALRM: ppo.stop})
+    try:
+        for moment in range(30):
+            try:
+                signal.setitimer(signal.ITIMER_REAL, seconds * (moment + 1) / 31)
+                checkpoints.write("last.pt")
+                time.sleep(1)
+            except KeyboardInterrupt:
+                assert len(torch.load(tmp_path / "last.pt")["weights"]) == 3000
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        ppo.set_handlers(handlers)
+
+
 @pytest.mark.slow
 def test_control_c_in_a_terminal(start, tmp_path, monkeypatch, capsys):
     """Ctrl-C reaches all processes. The run stops as with any other signal, and can be resumed."""
@@ -614,11 +665,12 @@ def test_memory_that_is_too_small_is_refused(monkeypatch, capsys, encoder, num_e
 
     stored = sum(x.nbytes for x in tree_leaves(make_storage(math.inf)))
     layers = sum(sizes) * (5 + 1) * num_envs  # rows of a minibatch and of a step
-    make_storage(free=2 * stored + 5 * layers)
+    weights = 4 * sum(x.numel() for x in agent.parameters())
+    make_storage(free=2 * stored + 5 * layers + 4 * weights)
     with pytest.raises(SystemExit):
-        make_storage(free=stored + layers)
+        make_storage(free=stored + layers + 3 * weights)
     line = capsys.readouterr().err
-    assert re.search(r"training needs [\d,]+ MiB, and [\d,]+ MiB of memory are free: try --num_steps 5, fewer", line)
+    assert re.search(r"training needs [\d,]+ MiB, and [\d,]+ MiB of memory are free: try --num_steps 5, more", line)
 
 
 @on_cpu_and_cuda

@@ -34,7 +34,7 @@ import ppo_rgb
         ("--num_envs 0", "num_envs"),
         ("--num_actors 0", "num_actors"),
         ("--num_envs 2 --num_actors 3", "--num_actors 3: there are 2 environments"),
-        ("--num_eval_envs 800", "--num_eval_envs 800: on a CPU, one process simulates at most 800"),
+        ("--num_eval_envs 800 --num_eval_episodes 800", "one process simulates at most 800"),
         ("--reconfiguration_freq 1 --num_envs 2 --num_actors 1", "--no-partial_reset"),
         ("--num_steps -1", "num_steps"),
         ("--learning_rate nan", "learning_rate"),
@@ -118,7 +118,8 @@ def test_one_process_at_a_time_downloads_physx(script, monkeypatch, tmp_path):
     monkeypatch.setattr(torch, "zeros", lambda *args, **kwargs: None)
     monkeypatch.setattr(script, "parse_backends", lambda *args: None)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    args = script.Args(sim_backend="physx_cuda:0", num_actors=1)
+    monkeypatch.setattr(script, "LOCAL_WORLD_SIZE", 2)  # of torchrun
+    args = script.Args(sim_backend="physx_cuda", num_actors=1)
     threads = [threading.Thread(target=script.check_simulation, args=(args,)) for _ in range(4)]
     for thread in threads:
         thread.start()

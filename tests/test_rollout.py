@@ -519,6 +519,21 @@ def test_actors_see_no_gpu(tmp_path, monkeypatch):
     assert os.environ["CUDA_VISIBLE_DEVICES"] == ""
 
 
+class VariedByItsBase(ppo.REGISTERED_ENVS["PegInsertionSide-v1"].cls):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+class TaskOfBaseEnv(ppo.sapien_env.BaseEnv):
+    """It has no __init__ of its own."""
+
+
+@pytest.mark.parametrize("cls, varies", [(VariedByItsBase, True), (TaskOfBaseEnv, False)])
+def test_tasks_that_vary_their_objects(monkeypatch, cls, varies):
+    monkeypatch.setattr(ppo, "find_task", lambda env_id: SimpleNamespace(cls=cls))
+    assert ppo.varies_objects("x") == varies
+
+
 PEG = replace(TWO, env_id="PegInsertionSide-v1")
 
 

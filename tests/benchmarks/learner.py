@@ -20,6 +20,7 @@ import tempfile
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -41,6 +42,7 @@ class NoSimulation(gym.Env):
     """As cheap as an environment can be: constant random observations and rewards. Episodes end at different times."""
 
     reconfiguration_freq, max_episode_steps, metadata = 0, LIMIT, {}
+    scene = SimpleNamespace(gpu_sim_enabled=False)
 
     def __init__(self, num_envs, device):
         self.num_envs, self.device = num_envs, device
