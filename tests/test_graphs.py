@@ -246,7 +246,7 @@ def test_how_often_the_host_waits(train, script, small, device, monkeypatch):
         an_iteration.append(Counter(PretendedGpu.waits[starts[-2] : starts[-1]]))
     assert an_iteration[0] == an_iteration[1]
     assert (an_iteration[2] - an_iteration[0]) == Counter(__bool__=3)
-    assert an_iteration[0] == Counter(item=3, tolist=2, __bool__=1, synchronize=1)
+    assert an_iteration[0] == Counter(item=2, tolist=3, __bool__=1, synchronize=1)
 
 
 def put_on_cpu(name):
