@@ -9,16 +9,15 @@ import importlib.metadata
 import math
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Optional
 
-PACKAGES = (
-    "mani-skill", "sapien", "torch", "gymnasium", "tensorboard", "tyro", "matplotlib", "psutil", "imageio", "filelock",
-)  # fmt: skip
-ROOT = Path(__file__).resolve().parent.parent  # ppo.py lies here
+ROOT = Path(__file__).resolve().parent.parent  # ppo.py lies here, and says what it needs
+PACKAGES = re.findall(r'^#     "([\w-]+).*>=([\d.]+)', (ROOT / "ppo.py").read_text(), flags=re.MULTILINE)
 
 VULKAN = """
 import sapien
@@ -98,6 +97,11 @@ def version(package: str) -> Optional[str]:
         return None
 
 
+def as_numbers(version: str) -> list[int]:
+    """Major and minor number, to compare."""
+    return [int(x) for x in re.findall(r"\d+", version)[:2]]
+
+
 def read(path: str) -> str:
     try:
         return Path(path).read_text().strip()
@@ -131,8 +135,10 @@ def show_shared_memory(cores: int) -> None:
 def main() -> None:
     remedy = "use Python 3.10, 3.11 or 3.12: mani-skill's dependencies have no other"
     row((3, 10) <= sys.version_info[:2] <= (3, 12), "Python", platform.python_version(), remedy)
-    for package in PACKAGES:
-        row(version(package) is not None, package, version(package) or "not installed", f"pip install {package}")
+    for package, lowest in PACKAGES:
+        found = version(package)
+        is_new = found is not None and as_numbers(found) >= as_numbers(lowest)
+        row(is_new, package, found or "not installed", f'pip install "{package}>={lowest}"')
     row(None, "wandb (for --track)", version("wandb") or "not installed")
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
