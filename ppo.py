@@ -252,7 +252,7 @@ class Args:
     eval_seed: int = 0
     """evaluation episode k starts from seed eval_seed + k, below 2^31; training uses seeds above"""
     stop_at_success: Optional[float] = None
-    """end the run when an evaluation's success_once reaches this rate"""
+    """end the run when an evaluation, other than the first one, has this success_once"""
     evaluate: bool = False
     """only evaluate --checkpoint, with the task and the network of its run"""
     checkpoint: Optional[str] = None
@@ -638,7 +638,7 @@ def train(args: Args, closing: contextlib.ExitStack) -> None:
             if local.capture_video:
                 film.record(actors.agent, f"videos/step_{global_step:09d}", args.eval_seed)
             is_solved = args.stop_at_success is not None and metrics.get("success_once", 0) >= args.stop_at_success
-            if is_last or is_solved and iteration > first_iteration:  # a run that was solved can be resumed
+            if is_last or is_solved and iteration > first_iteration:  # a solved run can be resumed
                 checkpoints.contents["finished"] = is_last
                 break
 
@@ -926,14 +926,15 @@ def find_reset_error(envs: ManiSkillVectorEnv) -> Optional[Exception]:
 
 
 def check_task(args: Args, envs: ManiSkillVectorEnv) -> None:
-    """Refuse partial resets that the task cannot do; print a note if gamma does not suit the length of its episodes."""
+    """Refuse observations that do not fit their space, and partial resets that the task cannot do; print a note if
+    gamma does not suit the length of its episodes."""
     obs, info = envs.reset()
     spaces = getattr(envs.single_observation_space, "spaces", {"obs": envs.single_observation_space})
     for k, space in spaces.items():
         x = obs[k] if isinstance(obs, dict) else obs
         if (x.shape[1:], x.dtype) != (space.shape, getattr(torch, space.dtype.name)):
-            raise RunError(f"observations are {x.dtype} {tuple(x.shape[1:])}, and their space has {space.dtype} "
-                           f"{space.shape}: a wrapper that changes them must call update_obs_space")  # fmt: skip
+            raise RunError(f"the observation {k} is {x.dtype} {tuple(x.shape[1:])}, and its space has {space.dtype} "
+                           f"{space.shape}: a wrapper that changes it must call update_obs_space")  # fmt: skip
     reset_error = find_reset_error(envs)
     if args.partial_reset and reset_error and {"success", "fail"} & info.keys():
         fail(f"{args.env_id} cannot reset some of several environments ({describe(reset_error)}): --no-partial_reset "
@@ -1552,8 +1553,8 @@ def make_agent(obs_space, action_space, args: Args, checkpoint: dict) -> Agent:
     agent = Agent(obs_space, action_space, args)
     if checkpoint:
         try:
-            bounds = dict(action_low=agent.action_low, action_high=agent.action_high)  # perhaps of another controller
-            agent.load_state_dict(checkpoint["agent"] | bounds)
+            bounds = dict(action_low=agent.action_low, action_high=agent.action_high)
+            agent.load_state_dict(checkpoint["agent"] | bounds)  # those of the checkpoint may be of another controller
         except RuntimeError as error:
             fail(f"{checkpoint['path']} is of another network or task: {error}")
     agent.load_state_dict(all_gather(agent.state_dict())[0])  # machines may turn a seed into different weights
@@ -1608,7 +1609,7 @@ class Checkpoints:
     def write(self, name: str) -> None:
         """Write another file, then rename it: at any moment there is the old checkpoint or the new one, whole."""
         if self.args.save_model and RANK == 0:
-            buffer = io.BytesIO()  # a signal while torch writes to a file may end the process
+            buffer = io.BytesIO()  # while torch writes to a file, it turns a signal into another error
             torch.save(self.contents, buffer)
             with open(self.run_dir / name.replace(".pt", ".tmp"), "wb") as file:
                 file.write(buffer.getbuffer())
@@ -1987,8 +1988,9 @@ def check_simulation(args: Args) -> None:
         try:
             torch.zeros(1, device=choose_device(local_args(args)) if on_gpu else f"cuda:{LOCAL_RANK}")
             if on_gpu:  # SAPIEN downloads PhysX's GPU library when it first needs it: one process at a time
-                lock = filelock.FileLock(Path.home() / ".sapien/physx.lock")
-                with lock if LOCAL_WORLD_SIZE > 1 else contextlib.nullcontext():
+                with contextlib.ExitStack() as downloading:
+                    with contextlib.suppress(OSError):  # a home that cannot be written
+                        downloading.enter_context(filelock.FileLock(Path.home() / ".sapien/physx.lock"))
                     sapien.physx.enable_gpu()
         except Exception as error:  # no driver, one too old for this torch, no such device, no library
             reason = str(error).splitlines()[0]

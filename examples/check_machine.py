@@ -98,8 +98,8 @@ def version(package: str) -> Optional[str]:
 
 
 def as_numbers(version: str) -> list[int]:
-    """Major and minor number, to compare."""
-    return [int(x) for x in re.findall(r"\d+", version)[:2]]
+    """To compare versions."""
+    return [int(x) for x in re.findall(r"\d+", version)[:3]]
 
 
 def read(path: str) -> str:

@@ -25,7 +25,7 @@ import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
-# copy that file as well, and import it from where it lies then
+# if you copy this file, copy push_to_goal.py as well and change this import
 from examples.push_to_goal import PushToGoalEnv
 
 

@@ -24,7 +24,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 from sapien.physx import PhysxMaterial
 
-# copy that file as well, and import it from where it lies then
+# if you copy this file, copy push_to_goal.py as well and change this import
 from examples.push_to_goal import PushToGoalEnv
 
 

@@ -71,12 +71,15 @@ def test_shared_memory(monkeypatch, capsys):
 
 def test_where_all_is_broken(tmp_path):
     """The table reports modules that cannot be imported, that crash the process, or that are too old."""
-    (tmp_path / "gymnasium-0.29.1.dist-info").mkdir()
-    (tmp_path / "gymnasium-0.29.1.dist-info/METADATA").write_text("Name: gymnasium\nVersion: 0.29.1\n")
+    for name, version in (("gymnasium", "0.29.1"), ("mani_skill", "3.0.0b22")):
+        (tmp_path / f"{name}-{version}.dist-info").mkdir()
+        text = f"Name: {name.replace('_', '-')}\nVersion: {version}\n"
+        (tmp_path / f"{name}-{version}.dist-info/METADATA").write_text(text)
     (tmp_path / "torch.py").write_text("raise OSError('libtorch.so: cannot open shared object file')")
     (tmp_path / "sapien.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     table = check_machine(PYTHONPATH=str(tmp_path))
     assert "libtorch.so: cannot open shared object file" in table
     assert "missing  gymnasium                 0.29.1" in table and '-> pip install "gymnasium>=1.0"' in table
+    assert "missing  mani-skill                3.0.0b22" in table
     assert "missing  Vulkan                    ended with exit code -11" in table
     assert "missing  state, CPU simulation     ended with exit code -11" in table

@@ -133,6 +133,7 @@ def test_a_solved_run_can_go_on(train):
     assert last["iteration"] == 4 and last["finished"]
 
 
+@on_cpu_and_cuda
 def test_actions_keep_the_bounds_of_the_task(train):
     """A policy that learned with one controller may go on with another one, which has other bounds."""
     _, checkpoint = train(total_timesteps=320)
@@ -141,6 +142,7 @@ def test_actions_keep_the_bounds_of_the_task(train):
     assert all(torch.equal(x, checkpoint["agent"][k]) for k, x in agent.named_parameters())
 
 
+@on_cpu_and_cuda
 def test_a_run_of_a_gpu_goes_on_with_all_cores(train, monkeypatch):
     """There, one process simulated all environments."""
     train(total_timesteps=320)
@@ -153,6 +155,7 @@ def test_a_run_of_a_gpu_goes_on_with_all_cores(train, monkeypatch):
     assert ppo.parse_args([*flags, "--num_actors", "3"]).num_actors == 3
 
 
+@on_cpu_and_cuda
 def test_a_finished_run_can_go_on(train, in_tmp):
     train(total_timesteps=320 * 2)
     metrics, last = train(total_timesteps=320 * 5, resume="runs/run1")

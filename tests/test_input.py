@@ -118,8 +118,7 @@ def test_one_process_at_a_time_downloads_physx(script, monkeypatch, tmp_path):
     monkeypatch.setattr(torch, "zeros", lambda *args, **kwargs: None)
     monkeypatch.setattr(script, "parse_backends", lambda *args: None)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setattr(script, "LOCAL_WORLD_SIZE", 2)  # of torchrun
-    args = script.Args(sim_backend="physx_cuda", num_actors=1)
+    args = script.Args(sim_backend="physx_cuda:0", num_actors=1)
     threads = [threading.Thread(target=script.check_simulation, args=(args,)) for _ in range(4)]
     for thread in threads:
         thread.start()

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-import ppo  # noqa: F401  # before mani_skill: it lets that use a software renderer
+import ppo  # noqa: F401  # before mani_skill: that can then use a software renderer
 
 # isort: split
 import gymnasium as gym
