@@ -1737,7 +1737,8 @@ class CudaGraph:
         self.num_calls += 1
         if self.num_calls == 1:
             self.obs, self.stream = copy.deepcopy(obs), torch.cuda.Stream()
-        tree_map(lambda old, new: old.copy_(new), self.obs, obs)
+        for old, new in zip(tree_leaves(self.obs), tree_leaves(obs)):
+            old.copy_(new)
         if self.num_calls <= 3:
             self.stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(self.stream):
@@ -1858,7 +1859,7 @@ def parse_args(argv: list[str]) -> Args:
     args = parse(args=argv, default=default)
     args.sim_backend = choose_backend(args)
     if given.resume is not None and args.sim_backend != run["sim_backend"]:
-        args.num_actors = given.num_actors
+        args.num_actors = given.num_actors  # a GPU has one, a CPU one a core
     if args.num_steps is None:
         batch_size = CPU_BATCH_SIZE if args.sim_backend == "physx_cpu" else GPU_BATCH_SIZE
         args.num_steps = max(5, batch_size // max(1, args.num_envs))

@@ -58,6 +58,11 @@ RUN = dict(
     total_timesteps=320 * 12, eval_freq=4, update_epochs=2, target_kl=None, anneal_lr=True, norm_obs=True,
     checkpoint_freq=3, save_freq=5,
 )  # fmt: skip
+# as a command, 8 minibatches an iteration
+COMMAND = (
+    "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
+    "--no-cuda --no-capture_video --desired_kl None"
+).split()
 
 
 @on_cpu_and_cuda
@@ -324,9 +329,8 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoint(in_update, in_tmp, mo
     """The run ends with one line, and the old checkpoint stays whole. /dev/full stands in for the temporary file."""
     monkeypatch.setattr(ppo, "make_envs", partial(batched_env.make_envs, device="cpu"))
     in_update(1, lambda: Path("runs/x/last.tmp").symlink_to("/dev/full"))
-    flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
-    flags += "--checkpoint_freq 3 --eval_freq 4 --exp_name x --no-cuda --no-capture_video --desired_kl None"
-    assert ppo.main(flags.split()) == 1
+    flags = ("--checkpoint_freq", "3", "--eval_freq", "4", "--exp_name", "x")
+    assert ppo.main([*COMMAND, *flags]) == 1
     errors = capsys.readouterr().err
     assert os.strerror(errno.ENOSPC) in errors and "last.pt is safe" in errors and "Traceback" not in errors
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 0
@@ -488,12 +492,10 @@ def start(tmp_path):
 def test_signals_keep_what_was_learned(in_update, in_tmp, monkeypatch, capsys):
     """The run ends as it was when its iteration began, and exits with 128 + the number of the signal."""
     monkeypatch.setattr(ppo, "make_envs", batched_env.make_envs)
-    flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
-    flags += "--no-cuda --no-capture_video --desired_kl None --eval_freq 0 --exp_name"
     handlers = [signal.getsignal(s) for s in ppo.STOP_SIGNALS]
     for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
         in_update(2, lambda signum=signum: os.kill(os.getpid(), signum))
-        assert ppo.main([*flags.split(), signum.name]) == 128 + signum
+        assert ppo.main([*COMMAND, "--eval_freq", "0", "--exp_name", signum.name]) == 128 + signum
         errors = capsys.readouterr().err
         assert f"stopped by {signum.name}" in errors and f"--resume runs/{signum.name}" in errors
         assert ppo.load_checkpoint(f"runs/{signum.name}/last.pt")["iteration"] == 2
@@ -506,9 +508,7 @@ def test_a_second_signal_does_not_spoil_the_checkpoint(in_update, in_tmp, monkey
     close = ppo.Checkpoints.close
     monkeypatch.setattr(ppo.Checkpoints, "close", lambda self: (os.kill(os.getpid(), signal.SIGTERM), close(self)))
     in_update(2, lambda: os.kill(os.getpid(), signal.SIGTERM))
-    flags = "--num_envs 32 --num_actors 1 --num_steps 10 --total_timesteps 3840 --num_minibatches 4 --update_epochs 2 "
-    flags += "--no-cuda --no-capture_video --eval_freq 0 --exp_name x"
-    assert ppo.main(flags.split()) == 143
+    assert ppo.main([*COMMAND, "--eval_freq", "0", "--exp_name", "x"]) == 143
     assert ppo.load_checkpoint("runs/x/last.pt")["iteration"] == 2
 
 

@@ -1,7 +1,7 @@
 """Training throughput of ppo.py with different numbers of processes of torchrun, one GPU each.
 
     uv run tests/benchmarks/ranks.py --ranks 1 2 4 8
-    uv run tests/benchmarks/ranks.py --ranks 1 2 --num_envs 8 --flags="--no-cuda --num_steps 100"     # on a CPU
+    uv run tests/benchmarks/ranks.py --ranks 1 2 --num_envs 8 --num_steps 100 --flags=--no-cuda     # on a CPU
 
 Each process has `--num_envs` environments, so the work grows with the number of processes. The numbers take turns, with
 several repetitions each, because the speed of a shared machine drifts: compare ratios. On a machine without a GPU, the
@@ -24,11 +24,9 @@ def steps_per_second(ranks, options):
     """Train; returns the median steps per second of whole iterations, of their rollouts and of their updates. The first
     two iterations warm up and do not count."""
     with tempfile.TemporaryDirectory() as folder:
-        flags = " ".join(options.flags).replace("=", " ").split()
-        steps = next((int(a) for f, a in zip(flags, flags[1:]) if f == "--num_steps"), 50)
-        batch = options.num_envs * steps * ranks
+        batch = options.num_envs * options.num_steps * ranks
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", ranks, SCRIPT,
-                   "--num_envs", options.num_envs * ranks, "--num_steps", steps, "--exp_name", "x",
+                   "--num_envs", options.num_envs * ranks, "--num_steps", options.num_steps, "--exp_name", "x",
                    "--total_timesteps", batch * options.iterations, "--eval_freq", 0,
                    "--num_eval_envs", ranks, "--num_eval_episodes", ranks, "--no-capture_video",
                    *options.flags]  # fmt: skip
@@ -46,6 +44,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--num_envs", type=int, default=512, help="environments of each process")
+    parser.add_argument("--num_steps", type=int, default=50)
     parser.add_argument("--iterations", type=int, default=8)
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--flags", type=shlex.split, default=[], help="further flags of ppo.py")
