@@ -77,7 +77,6 @@ humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 30
 locomotion() { control --learning_rate 3e-4 --ent_coef 0.01 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 3000000 "$@"; }
-hopper_hop_cpu() { locomotion --env_id MS-HopperHop-v1 --total_timesteps 4000000 "$@"; }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
 
 # --- states, CPU: in hand ---
