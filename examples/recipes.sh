@@ -76,14 +76,13 @@ humanoid_stand_cpu() { control --env_id MS-HumanoidStand-v1 --total_timesteps 30
 # the lower learning rate.
 locomotion() { control --learning_rate 3e-4 --ent_coef 0.01 "$@"; }
 
-# A hopper that cannot stand yet learns to throw itself forward, head over heels. So it learns to stand first:
-#
-#     bash examples/recipes.sh hopper_stand_cpu --exp_name stand
+hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 3000000 "$@"; }
+# A hopper that cannot stand yet may learn to throw itself forward, head over heels. So it learns to stand first:
+#     bash examples/recipes.sh hopper_stand_cpu --total_timesteps 1500000 --exp_name stand
 #     bash examples/recipes.sh hopper_hop_cpu --checkpoint runs/stand/last.pt
-#
-# With a larger standard deviation, it would fall while it learns to hop, and then throw itself forward all the same.
-hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --logstd_final -1.5 --total_timesteps 2000000 "$@"; }
-hopper_hop_cpu() { locomotion --env_id MS-HopperHop-v1 --ent_coef 0.003 --total_timesteps 1500000 "$@"; }
+hopper_hop_cpu() {
+    locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 2000000 "$@"
+}
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
 
 # --- states, CPU: in hand ---
