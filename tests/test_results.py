@@ -6,6 +6,7 @@ import shutil
 from dataclasses import asdict
 
 import pytest
+import torch
 from benchmarks import results
 from conftest import ROOT, read_metrics
 
@@ -69,6 +70,16 @@ def test_a_row_of_the_table(project, capsys):
     before, _, _, header, _, line, _, _, after = (project / "README.md").read_text().splitlines()
     assert (before, after) == ("before", "after") and line.count("|") == header.count("|")
     assert not (project / "results.png").exists(), "nothing was learned in 640 steps"
+
+
+@pytest.mark.slow
+def test_a_recipe_may_start_from_the_policy_of_another(project, monkeypatch):
+    flags = shlex.split(FLAGS)
+    monkeypatch.setattr(results, "STARTS_FROM", {"push_cube_cpu": ("pull_cube_cpu", flags)})
+    row = results.make_row("push_cube_cpu", 2, flags, 1)
+    first = torch.load(project / row["flags"]["checkpoint"])
+    assert (first["args"]["env_id"], first["args"]["seed"], first["finished"]) == ("PullCube-v1", 2, True)
+    assert (row["task"], row["steps"]) == ("PushCube-v1", 640)
 
 
 def make_row(recipe, seed, success=None, reward=0.5, at_end=0.0):
@@ -164,7 +175,7 @@ def test_rows_are_of_todays_recipes(monkeypatch):
     keys = [(row["recipe"], row["further_flags"], row["seed"]) for row in rows]
     assert len(set(keys)) == len(keys), "a row must not be there twice"
     commands = {recipe: results.find_command(recipe) for recipe in {row["recipe"] for row in rows}}
-    of_the_run = {"seed", "exp_name", "capture_video", "num_actors"}
+    of_the_run = {"seed", "exp_name", "capture_video", "num_actors", "checkpoint"}
     for row in rows:
         script, *flags = commands[row["recipe"]]
         if row["recipe"].endswith("_sb3"):
