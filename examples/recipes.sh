@@ -78,7 +78,7 @@ locomotion() { control --learning_rate 3e-4 --ent_coef 0.01 "$@"; }
 
 hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 3000000 "$@"; }
 # A hopper that cannot stand yet may learn to throw itself forward, head over heels. So it learns to stand first:
-#     bash examples/recipes.sh hopper_stand_cpu --total_timesteps 1500000 --exp_name stand
+#     bash examples/recipes.sh hopper_stand_cpu --no-anneal_lr --total_timesteps 1500000 --exp_name stand
 #     bash examples/recipes.sh hopper_hop_cpu --checkpoint runs/stand/last.pt
 hopper_hop_cpu() {
     locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 2000000 "$@"
