@@ -81,7 +81,7 @@ hopper_stand_cpu() { locomotion --env_id MS-HopperStand-v1 --total_timesteps 300
 #     bash examples/recipes.sh hopper_stand_cpu --no-anneal_lr --total_timesteps 1500000 --exp_name stand
 #     bash examples/recipes.sh hopper_hop_cpu --checkpoint runs/stand/last.pt
 hopper_hop_cpu() {
-    locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 2000000 "$@"
+    locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 4000000 "$@"
 }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
 
