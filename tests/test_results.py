@@ -185,4 +185,5 @@ def test_rows_are_of_todays_recipes(monkeypatch):
         today = asdict({"ppo.py": ppo, "ppo_rgb.py": ppo_rgb}[script].parse_args(flags))
         for name in today.keys() - of_the_run:
             assert row["flags"][name] == today[name], (row["recipe"], name)
+        assert (row["flags"]["checkpoint"] is not None) == (row["recipe"] in results.STARTS_FROM)
         assert row["steps"] == row["curve"][-1][0] and row["curve"][0][0] == 0
