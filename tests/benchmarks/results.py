@@ -40,7 +40,10 @@ EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256
 # Recipes that are compared with peers: ManiSkill's own flags, and Stable-Baselines3.
 COMPARED = ("push_cube", "pick_cube", "cartpole_balance", "cartpole_swing_up", "ant_walk")
 # Recipes that start from the last policy of another one with these flags, of the same seed.
-STARTS_FROM = {"hopper_hop_cpu": ("hopper_stand_cpu", ["--no-anneal_lr", "--total_timesteps", "1500000"])}
+STARTS_FROM = {
+    "hopper_hop_cpu": ("hopper_stand_cpu", ["--no-anneal_lr", "--total_timesteps", "1500000"]),
+    "ant_run_cpu": ("ant_walk_cpu", []),
+}
 TABLE_STARTS, TABLE_ENDS = "<!-- written by results.py -->", "<!-- end -->"
 
 
