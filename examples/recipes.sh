@@ -88,7 +88,7 @@ ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"
 #     bash examples/recipes.sh ant_walk_cpu --exp_name walk
 #     bash examples/recipes.sh ant_run_cpu --checkpoint runs/walk/last.pt
 ant_run_cpu() {
-    locomotion --env_id MS-AntRun-v1 --ent_coef 0 --logstd_final -1.5 --eval_freq 10 --total_timesteps 2500000 "$@"
+    locomotion --env_id MS-AntRun-v1 --ent_coef 0 --logstd_final -1.5 --eval_freq 10 --total_timesteps 4000000 "$@"
 }
 
 # --- states, CPU: in hand ---
