@@ -84,7 +84,7 @@ hopper_hop_cpu() {
     locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 4000000 "$@"
 }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
-# At 4 m/s, the reward of the first steps is small. So the ant learns to walk first:
+# The reward is for 4 m/s: the first slow steps earn little. So the ant learns to walk first:
 #     bash examples/recipes.sh ant_walk_cpu --exp_name walk
 #     bash examples/recipes.sh ant_run_cpu --checkpoint runs/walk/last.pt
 ant_run_cpu() {
