@@ -19,6 +19,8 @@ import ppo
 import ppo_rgb
 
 # isort: split
+import sapien
+from mani_skill.envs.tasks.tabletop.pull_cube_tool import PullCubeToolEnv
 from mani_skill.utils.structs import Pose
 
 
@@ -139,6 +141,47 @@ def test_curriculum():
     envs.close()
 
 
+def test_mended_reward(monkeypatch):
+    """It pays for a hook that pulls. The task's own reward pays more for one that cannot, however it is turned."""
+    env = make("examples.mended_reward:PullCubeToolMended-v1", num_envs=1)
+    task = env.unwrapped
+    env.reset(seed=40)
+    monkeypatch.setattr(task.agent, "is_grasping", lambda *args, **kwargs: torch.tensor([True]))
+
+    def rewards(cube_x, gap, angle=0.0):
+        """Of a hook `gap` metres behind the cube, if the tool points ahead: the mended reward, and the task's own."""
+        task.cube.set_pose(sapien.Pose([cube_x, 0, 0.02]))
+        turn = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+        task.l_shape_tool.set_pose(sapien.Pose([cube_x + gap - 0.13, -0.067, 0.025], turn))
+        info = task.evaluate()
+        return [c.compute_dense_reward(task, None, None, info).item() for c in (type(task), PullCubeToolEnv)]
+
+    touching, near, turned = rewards(0.15, 0), rewards(0.15, 0.06), rewards(0.15, 0.06, angle=-0.8)
+    assert touching[0] > near[0] + 0.5 > turned[0] + 1
+    assert touching[1] < near[1] - 0.5 and near[1] == pytest.approx(turned[1])
+    pulled = [rewards(x, 0)[0] for x in (0.15, 0.1, 0.05, 0, -0.02)]
+    assert np.all(np.diff(pulled) > 0.3) and pulled[-1] > pulled[-2] + 5 - 1e-3, "success must pay 5"
+    env.close()
+
+
+def test_mended_reward_is_the_only_difference():
+    """Scene, observations and success are the task's: a policy can go on there."""
+    histories, lengths = [], []
+    for env_id in ("examples.mended_reward:PullCubeToolMended-v1", "PullCubeTool-v1"):
+        env = make(env_id, num_envs=2)
+        torch.manual_seed(0)
+        obs, _ = env.reset(seed=[40, 41])
+        history = [obs]
+        for action in np.random.default_rng(1).uniform(-1, 1, (10, 2, 8)).astype(np.float32):
+            obs, reward, terminated, truncated, info = env.step(torch.from_numpy(action))
+            history += [obs, terminated, truncated, info["success"]]
+        histories.append(history)
+        lengths.append(ppo.REGISTERED_ENVS[env_id.split(":")[-1]].max_episode_steps)
+        env.close()
+    torch.testing.assert_close(*histories, rtol=0, atol=0)
+    assert lengths[0] == lengths[1]
+
+
 def at_goal(task, count):
     """Returns the pose of a cube that is at its goal, for the first `count` environments."""
     position = task.goal.pose.p[:count].clone()
@@ -222,7 +265,7 @@ def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
 # --- as commands ---
 
 
-@pytest.mark.parametrize("env_id", EXAMPLES)
+@pytest.mark.parametrize("env_id", [*EXAMPLES, "examples.mended_reward:PullCubeToolMended-v1"])
 def test_trains(env_id, in_tmp):
     flags = ("--env_id", env_id, "--num_envs", 2, "--num_actors", 1, "--num_steps", 20, "--total_timesteps", 80,
              "--num_minibatches", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2,
