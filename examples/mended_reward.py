@@ -22,8 +22,9 @@ from mani_skill.utils.registration import register_env
 @register_env("PullCubeToolMended-v1", max_episode_steps=100)
 class PullCubeToolMendedEnv(PullCubeToolEnv):
     def compute_dense_reward(self, obs, action, info):
-        """Returns (num_envs,): at most 2 for reaching the tool, and while it is held, 2 for that, 2 for a hook behind
-        the cube, 3 for a cube that is pulled with it, and 5 for success. ManiSkill divides the sum by 5."""
+        """Returns (num_envs,): at most 2 for reaching the tool. While the robot holds it: 2 for that, at most 2 for a
+        hook behind the cube, and 3 for a cube that is pulled with it. Success adds 5. ManiSkill divides the sum by 5.
+        """
         tool, cube = self.l_shape_tool.pose, self.cube.pose.p
         handle = (tool * sapien.Pose([0.02, 0, 0])).p
         reach = torch.linalg.norm(self.agent.tcp.pose.p - handle, dim=1)
