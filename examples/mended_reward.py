@@ -1,22 +1,53 @@
-"""Another reward for a task of ManiSkill: a subclass that overrides `compute_dense_reward`.
+"""Other rewards for two tasks of ManiSkill: subclasses that override `compute_dense_reward`.
+
+    FLAGS="--control_mode pd_joint_target_delta_pos --ent_coef 0.003 --no-partial_reset --num_envs 64 --num_steps 25"
+    python ppo.py --env_id examples.mended_reward:PickCubeSO100Mended-v1 --total_timesteps 2000000 $FLAGS
+
+In PickCubeSO100-v1, a small arm lifts a cube to its goal. The arm learns to press the cube on the table, because that
+holds it. To lift, it would have to risk the grasp for little. The reward below makes the table expensive, and pays more
+for a cube near its goal. Seed 1 succeeded in 0.92 of 256 other episodes, and in 0.85 at the end.
 
     FLAGS="--desired_kl 0.1 --logstd_lr_factor 3 --total_timesteps 800000"
     python ppo.py --env_id examples.mended_reward:PullCubeToolMended-v1 --exp_name pull $FLAGS
     python ppo.py --env_id PullCubeTool-v1 --checkpoint runs/pull/last.pt --gamma 0.97 $FLAGS
 
-Seed 1, stopped after 492,000 steps of the first and 307,000 of the second, succeeded in 0.93 of 256 other episodes.
-
 In PullCubeTool-v1, a robot pulls a cube to itself, with an L-shaped tool. The task's own reward pays for a place of the
 tool near the cube. There, the hook is 6 cm behind the cube, if the tool points ahead, and the tool may point anywhere.
 So policies learn to hold the tool at this place, and rarely to pull. The reward below pays for the place of the hook.
+Seeds 1 and 2, stopped after 307,000 steps of the second command, succeeded in 0.93 and 0.90 of 256 other episodes. Seed
+3, stopped after 338,000, succeeded in 0.5 to 0.6 of 128.
 
 Scene, observations and success are those of the task, so a policy that was trained here can go on there.
 """
 
 import sapien
 import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeSO100Env
 from mani_skill.envs.tasks.tabletop.pull_cube_tool import PullCubeToolEnv
 from mani_skill.utils.registration import register_env
+
+
+@register_env("PickCubeSO100Mended-v1", max_episode_steps=50)
+class PickCubeSO100MendedEnv(PickCubeSO100Env):
+    def compute_dense_reward(self, obs, action, info):
+        """Returns (num_envs,): at most 1 for reaching the cube. While the robot holds it: 1 for that, and at most 2 for
+        a cube near its goal. At the goal, at most 1 for a robot that stands still. A jaw on the table costs 2. With
+        success, the reward is 5. ManiSkill divides it by 5.
+        """
+        reach = torch.linalg.norm(self.cube.pose.p - self.agent.tcp_pose.p, dim=1)
+        to_goal = torch.linalg.norm(self.cube.pose.p - self.goal_site.pose.p, dim=1)
+        near_goal = 1 - torch.tanh(10 * to_goal)
+        speed = torch.linalg.norm(self.agent.robot.get_qvel()[:, :-1], dim=1)  # radians per second, without the jaw
+        still = 1 - torch.tanh(5 * speed)
+
+        jaws = (self.agent.finger1_link, self.agent.finger2_link)
+        forces = [self.scene.get_pairwise_contact_forces(jaw, self.table_scene.table) for jaw in jaws]
+        on_table = torch.linalg.norm(torch.stack(forces), dim=2).amax(dim=0) >= 0.01  # newtons
+
+        reward = 1 - torch.tanh(5 * reach) + info["is_grasped"] * (1 + 2 * near_goal)
+        reward += still * info["is_obj_placed"] - 2 * on_table
+        reward[info["success"]] = 5
+        return reward
 
 
 @register_env("PullCubeToolMended-v1", max_episode_steps=100)

@@ -20,6 +20,7 @@ import ppo_rgb
 
 # isort: split
 import sapien
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeSO100Env
 from mani_skill.envs.tasks.tabletop.pull_cube_tool import PullCubeToolEnv
 from mani_skill.utils.structs import Pose
 
@@ -141,7 +142,43 @@ def test_curriculum():
     envs.close()
 
 
-def test_mended_reward(monkeypatch):
+def test_reward_for_a_cube_off_the_table(monkeypatch):
+    """A hand on the table loses 2, and a cube on its way to the goal earns more than with the task's own reward."""
+    env = make("examples.mended_reward:PickCubeSO100Mended-v1", num_envs=1)
+    task = env.unwrapped
+    env.reset(seed=40)
+
+    def rewards():
+        """The mended reward, and the task's own."""
+        info = task.evaluate()
+        return [c.compute_dense_reward(task, None, None, info).item() for c in (type(task), PickCubeSO100Env)]
+
+    mended, own = rewards()
+    assert mended == pytest.approx(own) and 0 < own < 1, "far from cube and table, both pay for reaching alone"
+    task.cube.set_pose(sapien.Pose([0, 0.5, task.cube_half_size]))  # out of the way
+    down = torch.zeros(1, 6)
+    down[:, 1] = 1
+    for _ in range(40):
+        env.step(down)
+    mended, own = rewards()
+    assert mended == pytest.approx(own - 2), "the hand must be on the table now"
+
+    env.reset(seed=40)
+    monkeypatch.setattr(task.agent, "is_grasping", lambda *args, **kwargs: torch.tensor([True]))
+    goal = task.goal_site.pose.p[0].numpy()
+    gained = []
+    for distance in (0.05, 0.02):
+        task.cube.set_pose(sapien.Pose(goal + [0, 0, distance]))
+        reach = 1 - torch.tanh(5 * torch.linalg.norm(task.cube.pose.p - task.agent.tcp_pose.p)).item()
+        gained.append(np.array(rewards()) - reach)
+    assert gained[1][0] - gained[0][0] > 3 * (gained[1][1] - gained[0][1]) > 0
+    monkeypatch.setattr(task.agent, "is_static", lambda *args: torch.tensor([True]))
+    task.cube.set_pose(sapien.Pose(goal))
+    assert rewards() == [5, 5]
+    env.close()
+
+
+def test_reward_for_the_hook(monkeypatch):
     """It pays for a hook that pulls. The task's own reward pays more for one that cannot, however it is turned."""
     env = make("examples.mended_reward:PullCubeToolMended-v1", num_envs=1)
     task = env.unwrapped
@@ -164,15 +201,17 @@ def test_mended_reward(monkeypatch):
     env.close()
 
 
-def test_mended_reward_is_the_only_difference():
+@pytest.mark.parametrize("task", ["PickCubeSO100", "PullCubeTool"])
+def test_mended_reward_is_the_only_difference(task):
     """Scene, observations and success are the task's: a policy can go on there."""
     histories, lengths = [], []
-    for env_id in ("examples.mended_reward:PullCubeToolMended-v1", "PullCubeTool-v1"):
+    for env_id in (f"examples.mended_reward:{task}Mended-v1", f"{task}-v1"):
         env = make(env_id, num_envs=2)
         torch.manual_seed(0)
         obs, _ = env.reset(seed=[40, 41])
         history = [obs]
-        for action in np.random.default_rng(1).uniform(-1, 1, (10, 2, 8)).astype(np.float32):
+        shape = (10, *env.action_space.shape)
+        for action in np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32):
             obs, reward, terminated, truncated, info = env.step(torch.from_numpy(action))
             history += [obs, terminated, truncated, info["success"]]
         histories.append(history)
@@ -265,7 +304,10 @@ def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
 # --- as commands ---
 
 
-@pytest.mark.parametrize("env_id", [*EXAMPLES, "examples.mended_reward:PullCubeToolMended-v1"])
+MENDED = [f"examples.mended_reward:{task}Mended-v1" for task in ("PickCubeSO100", "PullCubeTool")]
+
+
+@pytest.mark.parametrize("env_id", [*EXAMPLES, *MENDED])
 def test_trains(env_id, in_tmp):
     flags = ("--env_id", env_id, "--num_envs", 2, "--num_actors", 1, "--num_steps", 20, "--total_timesteps", 80,
              "--num_minibatches", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2,
