@@ -5,7 +5,8 @@
 
 In PickCubeSO100-v1, a small arm lifts a cube to its goal. The arm learns to press the cube on the table, because that
 holds it. To lift, it would have to risk the grasp for little. The reward below makes the table expensive, and pays more
-for a cube near its goal. Seed 1 succeeded in 0.92 of 256 other episodes, and in 0.85 at the end.
+for a cube near its goal. Seeds 1 to 3 succeeded in 0.92, 0.78 and 0.89 of 256 other episodes, and at the end in 0.85,
+0.72 and 0.86.
 
     FLAGS="--desired_kl 0.1 --logstd_lr_factor 3 --total_timesteps 800000"
     python ppo.py --env_id examples.mended_reward:PullCubeToolMended-v1 --exp_name pull $FLAGS
