@@ -84,11 +84,13 @@ hopper_hop_cpu() {
     locomotion --env_id MS-HopperHop-v1 --logstd_final -1.5 --eval_freq 10 --total_timesteps 4000000 "$@"
 }
 ant_walk_cpu() { locomotion --env_id MS-AntWalk-v1 --total_timesteps 600000 "$@"; }
-# The reward is for 4 m/s: the first slow steps earn little. So the ant learns to walk first:
+# The reward of MS-AntRun-v1 is for 4 m/s: the first slow steps earn little. So the ant learns to walk first:
 #     bash examples/recipes.sh ant_walk_cpu --exp_name walk
 #     bash examples/recipes.sh ant_run_cpu --checkpoint runs/walk/last.pt
+# Training episodes end at a fall: see the task's file.
 ant_run_cpu() {
-    locomotion --env_id MS-AntRun-v1 --ent_coef 0 --logstd_final -1.5 --eval_freq 10 --total_timesteps 4000000 "$@"
+    locomotion --env_id examples.ant_run:AntRunUpright-v1 --bootstrap_at_done truncated --ent_coef 0 --logstd_final -1.5 \
+        --num_eval_episodes 16 --eval_freq 20 --total_timesteps 3000000 "$@"
 }
 
 # --- states, CPU: in hand ---
