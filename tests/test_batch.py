@@ -54,8 +54,8 @@ DIFFERENT = {
 WITHOUT_PARTIAL_RESETS = {
     "FMBAssembly1Easy-v1": "poses for all environments",
     "RotateSingleObjectInHandLevel1-v1": "poses for all environments",
-    "MS-AntWalk-v1": "random joint positions for all environments",
-    "MS-AntRun-v1": "random joint positions for all environments",
+    "MS-AntWalk-v1": "cameras of all environments",
+    "MS-AntRun-v1": "cameras of all environments",
     "MS-HopperHop-v1": "joint limits of all environments",
     "MS-HopperStand-v1": "joint limits of all environments",
 } | {f"RotateValveLevel{i}-v1": "angles for the environments that are reset only" for i in range(5)}

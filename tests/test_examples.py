@@ -22,6 +22,9 @@ import ppo_rgb
 import sapien
 from mani_skill.utils.structs import Pose
 
+MENDED = {f"examples.mended_reward:{task}Mended-v1": f"{task}-v1" for task in ("PickCubeSO100", "PullCubeTool")}
+OF_TASKS = MENDED | {"examples.ant_run:AntRunUpright-v1": "MS-AntRun-v1"}  # examples that extend a task of ManiSkill
+
 
 @pytest.mark.parametrize(
     "env_id",
@@ -200,24 +203,52 @@ def test_reward_for_the_hook(monkeypatch):
     env.close()
 
 
-@pytest.mark.parametrize("task", ["PickCubeSO100", "PullCubeTool"])
-def test_mended_reward_is_the_only_difference(task):
-    """Scene, observations and success are the task's: a policy can go on there."""
+@pytest.mark.parametrize("env_id", OF_TASKS)
+def test_the_rest_is_the_task(env_id):
+    """Scene, observations and success are the task's: a policy can go on there. Unless mended, so is the reward."""
     histories, lengths = [], []
-    for env_id in (f"examples.mended_reward:{task}Mended-v1", f"{task}-v1"):
-        env = make(env_id, num_envs=2)
+    for name in (env_id, OF_TASKS[env_id]):
+        env = make(name, num_envs=2)
         torch.manual_seed(0)
         obs, _ = env.reset(seed=[40, 41])
         history = [obs]
         shape = (10, *env.action_space.shape)
         for action in np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32):
             obs, reward, terminated, truncated, info = env.step(torch.from_numpy(action))
-            history += [obs, terminated, truncated, info["success"]]
+            history += [obs, terminated, truncated, info.get("success")]
+            if env_id not in MENDED:
+                history.append(reward)
         histories.append(history)
-        lengths.append(ppo.REGISTERED_ENVS[env_id.split(":")[-1]].max_episode_steps)
+        lengths.append(ppo.REGISTERED_ENVS[name.split(":")[-1]].max_episode_steps)
         env.close()
     torch.testing.assert_close(*histories, rtol=0, atol=0)
     assert lengths[0] == lengths[1]
+
+
+@pytest.mark.parametrize("evaluation", [False, True])
+def test_episodes_end_at_a_fall(evaluation):
+    """An ant on its back has failed, and starts again alone, but not in evaluations."""
+    env = make("examples.ant_run:AntRunUpright-v1", num_envs=3)
+    envs = ppo.ManiSkillVectorEnv(env, ignore_terminations=evaluation, record_metrics=True)
+    task, action = env.unwrapped, torch.ones(3, 8)
+    envs.reset(seed=[40, 41, 42])
+    for _ in range(5):
+        assert not any(envs.step(action)[2])
+    task.scene._reset_mask[[0, 2]] = False
+    task.agent.robot.set_root_pose(sapien.Pose([0, 0, 1], [0, 1, 0, 0]))
+    task.scene._reset_mask[:] = True
+    task.scene._gpu_apply_all()
+    task.scene._gpu_fetch_all()
+    terminated, _, info = envs.step(action)[2:]
+    if evaluation:
+        assert not any(terminated) and info["fail"].tolist() == [False, True, False]
+        assert task.elapsed_steps.tolist() == [6, 6, 6]
+    else:
+        assert terminated.tolist() == info["final_info"]["fail"].tolist() == [False, True, False]
+        assert task.elapsed_steps.tolist() == [6, 0, 6]
+        stand = torch.tensor(task.agent.keyframes["stand"].qpos)
+        assert [bool((qpos - stand).abs().max() <= 0.01) for qpos in task.agent.robot.qpos] == [False, True, False]
+    envs.close()
 
 
 def at_goal(task, count):
@@ -303,10 +334,7 @@ def test_broken_copies_are_found(fault, tmp_path, monkeypatch):
 # --- as commands ---
 
 
-MENDED = [f"examples.mended_reward:{task}Mended-v1" for task in ("PickCubeSO100", "PullCubeTool")]
-
-
-@pytest.mark.parametrize("env_id", [*EXAMPLES, *MENDED])
+@pytest.mark.parametrize("env_id", [*EXAMPLES, *OF_TASKS])
 def test_trains(env_id, in_tmp):
     flags = ("--env_id", env_id, "--num_envs", 2, "--num_actors", 1, "--num_steps", 20, "--total_timesteps", 80,
              "--num_minibatches", 2, "--num_eval_envs", 2, "--num_eval_episodes", 2,
