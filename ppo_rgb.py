@@ -245,7 +245,7 @@ class Args:
     channels_last: bool = True
     """keep the convolutions' tensors in channels-last order"""
     amp: bool = False
-    """run the encoder in bfloat16 (automatic mixed precision); slow on a CPU, and no faster on an H200"""
+    """run the encoder in bfloat16 (autocast); faster on some CPUs, slow on others, no faster on an H200"""
     norm_obs: bool = False
     """normalise the state by its running mean and variance"""
     layer_norm: bool = False

@@ -3,9 +3,9 @@
     bash examples/recipes.sh ant_walk_cpu --exp_name walk
     bash examples/recipes.sh ant_run_cpu --checkpoint runs/walk/last.pt
 
-An ant that falls does not get up again, and an episode of the task has 1,000 steps. Here, the next episode starts at
-once, so training sees more starts, when most ants fall. `--bootstrap_at_done truncated` says that no reward follows a
-fall. Observations and reward are those of the task. So are evaluations, whose episodes go on after a fall.
+An ant that falls hardly ever gets up again, and an episode of the task has 1,000 steps. Here, the next episode starts
+at once, so training sees more starts, when most ants fall. `--bootstrap_at_done truncated` says that no reward follows
+a fall. Observations and reward are those of the task. So are evaluations, whose episodes go on after a fall.
 """
 
 import torch
