@@ -15,8 +15,9 @@ for a cube near its goal. Seeds 1 to 3 succeeded in 0.92, 0.78 and 0.89 of 256 o
 In PullCubeTool-v1, a robot pulls a cube to itself, with an L-shaped tool. The task's own reward pays for a place of the
 tool near the cube. There, the hook is 6 cm behind the cube, if the tool points ahead, and the tool may point anywhere.
 So policies learn to hold the tool at this place, and rarely to pull. The reward below pays for the place of the hook,
-and for success only with the hook: one policy had learned to hit the cube aside. Seeds 1 to 3 succeeded in 0.96, 0.97
-and 0.99 of 256 other episodes, and at the end in 0.96, 0.97 and 0.98.
+and for success only with the hook: one policy had learned to hit the cube aside. The second command looks further
+ahead, because the hook often has to go round the cube. Seeds 1 to 3 succeeded in 0.96, 0.97 and 0.99 of 256 other
+episodes, and at the end in 0.96, 0.97 and 0.98.
 
 Scene, observations and success are those of the task, so a policy that was trained here can go on there.
 """
@@ -72,4 +73,5 @@ class PullCubeToolMendedEnv(PullCubeToolEnv):
         pulled = 1 - torch.tanh(5 * too_far.clamp(min=0))
 
         is_grasping = self.agent.is_grasping(self.l_shape_tool, max_angle=20)
-        return 2 * (1 - torch.tanh(5 * reach)) + is_grasping * (2 + (2 + 3 * pulled + 5 * info["success"]) * hooked)
+        with_hook = hooked * (2 + 3 * pulled + 5 * info["success"])
+        return 2 * (1 - torch.tanh(5 * reach)) + is_grasping * (2 + with_hook)
