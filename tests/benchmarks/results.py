@@ -41,6 +41,7 @@ EVALUATION = ("--evaluate", "--eval_seed", "100000", "--num_eval_episodes", "256
 COMPARED = ("push_cube", "pick_cube", "cartpole_balance", "cartpole_swing_up", "ant_walk")
 # Recipes that start from the last policy of another one with these flags, of the same seed.
 STARTS_FROM = {
+    "pull_cube_tool_cpu": ("pull_cube_tool_cpu", ["--gamma", "0.9", "--total_timesteps", "400000"]),
     "hopper_hop_cpu": ("hopper_stand_cpu", ["--no-anneal_lr", "--total_timesteps", "1500000"]),
     "ant_run_cpu": ("ant_walk_cpu", []),
 }
