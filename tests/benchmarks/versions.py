@@ -1,0 +1,60 @@
+"""Whether the commits that measured the rows of results.jsonl train as this one does: with the same flags and seed,
+both must end with the same weights, bit for bit.
+
+    python tests/benchmarks/versions.py
+    python tests/benchmarks/versions.py --recipes push_cube_cpu --iterations 78          # the whole run
+
+The runs are short ones from scratch, also those of recipes that start from a checkpoint. Rows of Stable-Baselines3 are
+left out.
+"""
+
+import argparse
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+from results import FOLDER, ROOT, find_command, find_recipes, group, read_rows
+
+
+def train(project: Path, row: dict, num_iterations: int) -> dict[str, torch.Tensor]:
+    """The weights after a short run of a row's flags, by the script in this folder."""
+    flags, name = row["flags"], f"versions_{row['recipe']}_{row['commit']}"
+    total = num_iterations * flags["num_envs"] * flags["num_steps"]
+    command = [sys.executable, *find_command(row["recipe"]), *shlex.split(row["further_flags"])]
+    command += ["--seed", str(flags["seed"]), "--num_actors", str(flags["num_actors"]), "--no-capture_video"]
+    command += ["--total_timesteps", str(total), "--num_eval_episodes", "2", "--exp_name", name]
+    run_dir = project / "runs" / name
+    shutil.rmtree(run_dir, ignore_errors=True)
+    done = subprocess.run(command, cwd=project, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stderr[-2000:]}")
+    return torch.load(run_dir / "last.pt", map_location="cpu")["agent"]
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    recipes = [recipe for recipe in find_recipes() if not recipe.endswith("_sb3")]
+    parser.add_argument("--recipes", nargs="+", choices=recipes, default=recipes)
+    parser.add_argument("--iterations", type=int, default=10)
+    options = parser.parse_args(argv)
+    groups = group(row for row in read_rows(FOLDER / "results.jsonl") if row["recipe"] in options.recipes)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as executor:
+        for name, rows in groups.items():
+            for row in {row["commit"]: row for row in rows}.values():  # one of each commit
+                project = Path(folder) / row["commit"]
+                if not project.exists():
+                    subprocess.run(["git", "clone", "-q", ROOT, project], check=True)
+                    subprocess.run(["git", "checkout", "-q", row["commit"]], cwd=project, check=True)
+                both = [executor.submit(train, x, row, options.iterations) for x in (project, ROOT)]
+                then, now = (future.result() for future in both)
+                is_same = then.keys() == now.keys() and all(torch.equal(then[k], now[k]) for k in now)
+                print(f"{row['commit']}  {'the same' if is_same else 'DIFFERENT'}  {name}", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
