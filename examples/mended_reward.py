@@ -8,9 +8,8 @@ holds it. To lift, it would have to risk the grasp for little. The reward below 
 for a cube near its goal. Seeds 1 to 3 succeeded in 0.92, 0.78 and 0.89 of 256 other episodes, and at the end in 0.85,
 0.72 and 0.86.
 
-    FLAGS="--env_id examples.mended_reward:PullCubeToolMended-v1 --desired_kl 0.1 --logstd_lr_factor 3"
-    python ppo.py --exp_name pull --total_timesteps 400000 $FLAGS
-    python ppo.py --checkpoint runs/pull/last.pt --gamma 0.97 --total_timesteps 1200000 $FLAGS
+    bash examples/recipes.sh pull_cube_tool_cpu --gamma 0.9 --total_timesteps 400000 --exp_name pull
+    bash examples/recipes.sh pull_cube_tool_cpu --checkpoint runs/pull/last.pt
 
 In PullCubeTool-v1, a robot pulls a cube to itself, with an L-shaped tool. The task's own reward pays for a place of the
 tool near the cube. There, the hook is 6 cm behind the cube, if the tool points ahead, and the tool may point anywhere.

@@ -111,10 +111,10 @@ def describe_processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def run_script(*command: str) -> str:
+def run_script(*command: str, project: Path = ROOT) -> str:
     """Returns what it printed. The recipes call `python`: let that be this interpreter."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(command, cwd=ROOT, env={**os.environ, "PATH": path}, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=project, env={**os.environ, "PATH": path}, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
     return done.stdout

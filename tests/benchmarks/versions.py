@@ -11,28 +11,25 @@ left out.
 import argparse
 import shlex
 import shutil
-import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
-from results import FOLDER, ROOT, find_command, find_recipes, group, read_rows
+from results import FOLDER, ROOT, find_command, find_recipes, group, read_rows, run_script
 
 
 def train(project: Path, row: dict, num_iterations: int) -> dict[str, torch.Tensor]:
     """The weights after a short run of a row's flags, by the script in this folder."""
-    flags, name = row["flags"], f"versions_{row['recipe']}_{row['commit']}"
+    flags, name = row["flags"], f"versions_{row['recipe']}"
     total = num_iterations * flags["num_envs"] * flags["num_steps"]
-    command = [sys.executable, *find_command(row["recipe"]), *shlex.split(row["further_flags"])]
+    command = ["python", *find_command(row["recipe"]), *shlex.split(row["further_flags"])]
     command += ["--seed", str(flags["seed"]), "--num_actors", str(flags["num_actors"]), "--no-capture_video"]
     command += ["--total_timesteps", str(total), "--num_eval_episodes", "2", "--exp_name", name]
     run_dir = project / "runs" / name
     shutil.rmtree(run_dir, ignore_errors=True)
-    done = subprocess.run(command, cwd=project, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{shlex.join(command)} ended with {done.returncode}:\n{done.stderr[-2000:]}")
+    run_script(*command, project=project)
     return torch.load(run_dir / "last.pt", map_location="cpu")["agent"]
 
 
@@ -45,15 +42,15 @@ def main(argv: list[str]) -> None:
     groups = group(row for row in read_rows(FOLDER / "results.jsonl") if row["recipe"] in options.recipes)
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as executor:
         for name, rows in groups.items():
-            for row in {row["commit"]: row for row in rows}.values():  # one of each commit
-                project = Path(folder) / row["commit"]
+            projects = [Path(folder) / commit for commit in sorted({row["commit"] for row in rows})]
+            for project in projects:
                 if not project.exists():
-                    subprocess.run(["git", "clone", "-q", ROOT, project], check=True)
-                    subprocess.run(["git", "checkout", "-q", row["commit"]], cwd=project, check=True)
-                both = [executor.submit(train, x, row, options.iterations) for x in (project, ROOT)]
-                then, now = (future.result() for future in both)
-                is_same = then.keys() == now.keys() and all(torch.equal(then[k], now[k]) for k in now)
-                print(f"{row['commit']}  {'the same' if is_same else 'DIFFERENT'}  {name}", flush=True)
+                    run_script("git", "clone", "-q", str(ROOT), str(project))
+                    run_script("git", "checkout", "-q", project.name, project=project)
+            now, *then = executor.map(lambda x: train(x, rows[0], options.iterations), [ROOT, *projects])
+            for project, agent in zip(projects, then):
+                is_same = agent.keys() == now.keys() and all(torch.equal(agent[k], now[k]) for k in now)
+                print(f"{project.name}  {'the same' if is_same else 'DIFFERENT'}  {name}", flush=True)
 
 
 if __name__ == "__main__":
