@@ -1140,6 +1140,7 @@ class BatchedPhysx:
         for i in self._changed_rows(self.cuda_rigid_body_data, self.root_rows, slice(0, 7)):
             row = self.cuda_rigid_body_data.data[self.root_rows[i]].numpy()
             self.robots[i].root_pose = sapien.Pose(row[:3], row[3:7])
+            self.robots[i].qvel = self.robots[i].qvel  # so that PhysX computes the links' velocities again
 
     def gpu_apply_articulation_root_velocity(self) -> None:
         for i in self._changed_rows(self.cuda_rigid_body_data, self.root_rows, slice(7, 13)):

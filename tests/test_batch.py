@@ -507,6 +507,19 @@ def test_a_fetch_leaves_other_writes_alone(build):
     torch.testing.assert_close(env.agent.robot.qpos, wanted)
 
 
+def test_link_velocities_of_a_robot_that_was_put_elsewhere(build):
+    """They follow from its pose and its joints, and from nothing before: ManiSkill applies the root's pose last."""
+    batch, single = build("MS-HumanoidStand-v1", 2), build("MS-HumanoidStand-v1", 1)
+    for seed in (1, 0):
+        batch.reset(seed=seed), single.reset(seed=seed)
+    a, b = batch.agent.robot, single.agent.robot
+    b.set_root_pose(Pose.create(a.pose.raw_pose[1:]))
+    b.set_qpos(a.qpos[1:]), b.set_qvel(a.qvel[1:])
+    for x, y in zip(a.links, b.links):
+        assert equal(x.linear_velocity, y.linear_velocity) and equal(x.angular_velocity, y.angular_velocity), x.name
+    assert b.links[-1].linear_velocity.any()
+
+
 def test_link_velocities_of_merged_links(build):
     """A merged view of a root and another link has the velocities of both."""
     env = build("PickCube-v1", 2)
