@@ -1,5 +1,5 @@
-"""Whether the commits that measured the rows of results.jsonl train as this one does: with the same flags and seed,
-both must end with the same weights, bit for bit.
+"""Whether the commits that measured the rows of results.jsonl train and evaluate as this one does: with the same flags
+and seed, both must end with the same weights and the same evaluations, bit for bit.
 
     python tests/benchmarks/versions.py
     python tests/benchmarks/versions.py --recipes push_cube_cpu --iterations 78          # the whole run
@@ -20,17 +20,30 @@ import torch
 from results import FOLDER, ROOT, find_command, find_recipes, group, read_rows, run_script
 
 
-def train(project: Path, row: dict, num_iterations: int) -> dict[str, torch.Tensor]:
-    """The weights after a short run of a row's flags, by the script in this folder."""
+def train(project: Path, row: dict, num_iterations: int) -> tuple[dict[str, torch.Tensor], list]:
+    """Train shortly with the flags of a row, by the script in this folder. Returns the weights, and the metrics of each
+    evaluation."""
     flags, name = row["flags"], f"versions_{row['recipe']}"
     total = num_iterations * flags["num_envs"] * flags["num_steps"]
     command = ["python", *find_command(row["recipe"]), *shlex.split(row["further_flags"])]
     command += ["--seed", str(flags["seed"]), "--num_actors", str(flags["num_actors"]), "--no-capture_video"]
-    command += ["--total_timesteps", str(total), "--num_eval_episodes", "2", "--exp_name", name]
+    command += ["--total_timesteps", str(total), "--num_eval_episodes", "8", "--exp_name", name]
     run_dir = project / "runs" / name
     shutil.rmtree(run_dir, ignore_errors=True)
     run_script(*command, project=project)
-    return torch.load(run_dir / "last.pt", map_location="cpu")["agent"]
+    evaluations = [
+        [row.get(k) for k in ("return", "success_once", "success_at_end", "episode_len")]
+        for row in read_rows(run_dir / "metrics.jsonl")
+        if row["kind"] == "eval"
+    ]
+    return torch.load(run_dir / "last.pt", map_location="cpu")["agent"], evaluations
+
+
+def is_same(run: tuple, other: tuple) -> bool:
+    (agent, evaluations), (other_agent, other_evaluations) = run, other
+    if agent.keys() != other_agent.keys() or evaluations != other_evaluations:
+        return False
+    return all(torch.equal(agent[k], other_agent[k]) for k in agent)
 
 
 def main(argv: list[str]) -> None:
@@ -48,9 +61,8 @@ def main(argv: list[str]) -> None:
                     run_script("git", "clone", "-q", str(ROOT), str(project))
                     run_script("git", "checkout", "-q", project.name, project=project)
             now, *then = executor.map(lambda x: train(x, rows[0], options.iterations), [ROOT, *projects])
-            for project, agent in zip(projects, then):
-                is_same = agent.keys() == now.keys() and all(torch.equal(agent[k], now[k]) for k in now)
-                print(f"{project.name}  {'the same' if is_same else 'DIFFERENT'}  {name}", flush=True)
+            for project, run in zip(projects, then):
+                print(f"{project.name}  {'the same' if is_same(run, now) else 'DIFFERENT'}  {name}", flush=True)
 
 
 if __name__ == "__main__":
